@@ -16,12 +16,12 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_origin, get_type_hints
 
-import typer
-
 from ipsys_log.app.cli.console import say
-from ipsys_log.app.cli.options import LogList, Option, flag, log_argument, option
-from ipsys_log.app.cli.pages import Web, WebPort, check_playback_page, serve_playback
+from ipsys_log.app.cli.options import LogList, Option, flag, log_argument, option, setting, switch
+from ipsys_log.app.cli.pages import Web, WebPort, check_dashboard, serve_playback
 from ipsys_log.app.cli.signals import allow_interrupt, runs_until_stopped, stop_on_signal, writes_nothing
+from ipsys_log.errors import IpsysError
+from ipsys_log.extras import check_installed
 from ipsys_log.sinks.streams import StreamOption, StreamSettings
 
 if TYPE_CHECKING:
@@ -39,38 +39,20 @@ _KEY = re.compile(r"\x1b\[[A-D]|.", re.DOTALL)
 _RATES = (0.1, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0)
 
 Logs = Annotated[LogList, log_argument(help="Logs to play, files or URLs, merged by time.")]
-RigFile = Annotated[
-    Path | None,
-    typer.Option("--rig", metavar="FILE", help="Open the streams of this rig file (lab.toml)."),
-]
-Rate = Annotated[
-    float, typer.Option("--rate", metavar="FACTOR", help="Play faster or slower: 2 is twice as fast.")
-]
-Loop = Annotated[bool, typer.Option("--loop", help="Begin again at the end.")]
-StartPaused = Annotated[bool, typer.Option("--start-paused", help="Wait for a key at the start.")]
+RigFile = Annotated[Path | None, setting("--rig", "FILE", "Open the streams of this rig file (lab.toml).")]
+Rate = Annotated[float, setting("--rate", "FACTOR", "Play faster or slower: 2 is twice as fast.")]
+Loop = Annotated[bool, switch("--loop", "Begin again at the end.")]
+StartPaused = Annotated[bool, switch("--start-paused", "Wait for a key at the start.")]
 StartOffset = Annotated[
-    float,
-    typer.Option("--start-offset", metavar="SECONDS", help="Begin so long after the first position."),
+    float, setting("--start-offset", "SECONDS", "Begin so long after the first position.")
 ]
-Run = Annotated[
-    str | None,
-    typer.Option("--run", metavar="NAME", help="Play the tracks of this run. Default: the newest."),
-]
+Run = Annotated[str | None, setting("--run", "NAME", "Play the tracks of this run. Default: the newest.")]
 Topics = Annotated[
     list[str] | None,
-    typer.Option(
-        "--topics",
-        metavar="TOPIC",
-        help="Play this topic instead, such as /truth/tracks; repeat it for several.",
-    ),
+    setting("--topics", "TOPIC", "Play this topic instead, such as /truth/tracks; repeat it for several."),
 ]
 Restamp = Annotated[
-    str,
-    typer.Option(
-        "--restamp",
-        metavar="original|now",
-        help="Give the positions their capture times, or the present time.",
-    ),
+    str, setting("--restamp", "original|now", "Give the positions their capture times, or the present time.")
 ]
 
 
@@ -159,8 +141,6 @@ def choose_streams(
 
 def _check_effect(given: Collection[str], settings: StreamSettings) -> None:
     """Check that each option belongs to a stream."""
-    from ipsys_log.errors import IpsysError
-
     if given and not settings:
         name = next(iter(given)).replace("robots", "robot").replace("_", "-")
         raise IpsysError(f"--{name}: has no effect without a stream; add one, such as --udp 127.0.0.1:9870")
@@ -201,8 +181,6 @@ def stream(
         ipsys stream monday.mcap --vrpn --start-offset 20    # port 3883
     """
     allow_interrupt("stopped before the first position was sent")
-    from ipsys_log.errors import IpsysError
-    from ipsys_log.extras import check_installed
     from ipsys_log.live_runs.player import Player
     from ipsys_log.messages.rig_file import load_rig
     from ipsys_log.sinks.playback import PlaybackOptions
@@ -216,7 +194,7 @@ def stream(
     settings = choose_streams(described, folder, has_page=web, **streams)
     if not settings and not web:
         raise IpsysError("no stream is given; name one, such as --udp 127.0.0.1:9870, or add --web")
-    port = check_playback_page(web, streams["host"], web_port)
+    port = check_dashboard(web, streams["host"], web_port)
     options = PlaybackOptions(rate, loop, start_paused, start_offset, restamp == "now")
     player = Player(logs, run, topics or (), options, settings, say=say, has_dashboard=web)
     stop_on_signal(player.stop)

@@ -24,11 +24,7 @@ from ipsys_log.messages.channels import EVALUATION, MODEL, TRACKS
 from ipsys_log.models.table import is_known, reads_height
 from ipsys_log.statistics.accuracy import CROSS_VALIDATION, POOLED, count_repeats, root_mean_square_m
 from ipsys_log.statistics.ground_truth import TrackErrors, gather_paths, track_errors
-from ipsys_log.tools.trajectory_errors import (
-    TrajectoryErrors,
-    pool_trajectories,
-    trajectory_errors,
-)
+from ipsys_log.tools.trajectory_errors import TrajectoryErrors, pool_trajectories, trajectory_errors
 
 
 class ErrorRow(NamedTuple):

@@ -91,11 +91,6 @@ class Dashboard:
     Attributes
     ----------
     end : None as long as messages come, then ``ended``, or ``failed`` after an error of this sink.
-
-    Raises
-    ------
-    IpsysError
-        The model or the intrinsics of a camera are not valid.
     """
 
     name = "the dashboard"

@@ -19,7 +19,9 @@ from stream_server import free_ports
 
 from ipsys_log.messages import Message, Track, Tracks
 from ipsys_log.sinks.sink import FanOut, InlineSink, Sink
-from ipsys_log.sinks.streams.settings import StreamSettings, open_streams
+from ipsys_log.sinks.streams import StreamSettings
+from ipsys_log.sinks.streams.opening import open_streams
+from ipsys_log.sinks.streams.poses import StreamContext
 
 __all__ = ["ROBOT", "cost_rows", "hand_over_rows"]
 
@@ -91,7 +93,7 @@ def _delays_ms(count: int, is_queued: bool) -> list[float]:
         sent.release()
 
     delays_ms = []
-    with open_streams(_all_streams(), {_TOPIC}, lambda: 0, lambda kind, text: None, 1) as streams:
+    with open_streams(_context(_all_streams())) as streams:
         inline = [_Inline(stream, note) for stream in streams]
         sinks: Sequence[Sink] = [_Queued(sink) for sink in inline] if is_queued else inline
         with FanOut(sinks, lambda kind, text: None) as show, _busy():
@@ -103,6 +105,10 @@ def _delays_ms(count: int, is_queued: bool) -> list[float]:
                     sent.acquire(timeout=_LIMIT_S)
                 delays_ms.append(_MS_PER_S * (times_s[0] - begin_s))
     return delays_ms
+
+
+def _context(settings: StreamSettings) -> StreamContext:
+    return StreamContext(settings, {_TOPIC}, lambda: 0, lambda kind, text: None, 1)
 
 
 def _all_streams() -> StreamSettings:
@@ -151,7 +157,7 @@ def cost_rows(rounds: int) -> list[Row]:
 
 def _cost_ms(settings: StreamSettings) -> float:
     messages = [_message(number) for number in range(_MESSAGES)]
-    with open_streams(settings, {_TOPIC}, lambda: 0, lambda kind, text: None, 1) as (stream,):
+    with open_streams(_context(settings)) as (stream,):
         for message in messages[:10]:
             stream.send(message)
         begin_s = time.process_time()

@@ -457,7 +457,7 @@ def live(
         from ipsys_log.capture.live_plan import check_start, shown_run
         from ipsys_log.exchange.lab_files import read_lab
         from ipsys_log.live_runs import pipeline
-        from ipsys_log.sinks.streams.settings import check_streams, open_live_streams, settings_of_rig
+        from ipsys_log.sinks.streams.opening import check_streams, open_live_streams, settings_of_rig
 
         lab = read_lab(Path(rig), cameras, calibrations or {})
         for camera, text in lab.assumed.items():
@@ -541,16 +541,16 @@ def play(
     ...         print(tracks.time_ns, tracks.tracks)
     """
     from ipsys_log.sinks.playback import PlaybackOptions
-    from ipsys_log.sinks.streams.settings import StreamSettings
+    from ipsys_log.sinks.streams import StreamSettings
 
     options = PlaybackOptions(rate, loop, start_paused, start_offset_s, restamp)
     path = None if key is None else Path(key)
     settings = StreamSettings(
-        host,
-        tuple(udp),
-        path,
-        vrpn,
-        tuple(mavlink),
+        host=host,
+        udp=tuple(udp),
+        key=path,
+        vrpn=vrpn,
+        mavlink=tuple(mavlink),
         robots=tuple(robots),
         ros2=ros2,
         ros2_domain=ros2_domain,

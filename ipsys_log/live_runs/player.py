@@ -32,7 +32,9 @@ from ipsys_log.sinks.selection import (
     viewed_topics,
 )
 from ipsys_log.sinks.sink import FanOut, Sink
-from ipsys_log.sinks.streams.settings import Stream, StreamSettings, open_streams
+from ipsys_log.sinks.streams import StreamSettings
+from ipsys_log.sinks.streams.opening import Stream, open_streams
+from ipsys_log.sinks.streams.poses import StreamContext
 
 if TYPE_CHECKING:
     from ipsys_log.sinks.rerun.viewer import ViewerPage
@@ -190,10 +192,9 @@ class Player:
                 logs = [(session, dashboard_topics(session, chosen)) for session, chosen in logs]
             playback = self._playback = _open_playback(logs, options, clock)
             tracks = {chosen.tracks for _, chosen in logs}
-            number, is_replayed = playback.session, not options.restamp
-            self._streams: Sequence[Stream] = self._stack.enter_context(
-                open_streams(settings, tracks, playback.now_ns, self._warn, number, robots, is_replayed)
-            )
+            number, is_replayed, now_ns = playback.session, not options.restamp, playback.now_ns
+            context = StreamContext(settings, tracks, now_ns, self._warn, number, robots, is_replayed)
+            self._streams: Sequence[Stream] = self._stack.enter_context(open_streams(context))
         except BaseException:
             self._stack.close()
             raise

@@ -102,8 +102,8 @@ METHOD = StageParameter(
 )
 MODEL = StageParameter(
     name="model",
-    help="Model: rigid, poly, ann, kriging, kriging-regression, rayplane, best, joint, or a hybrid such "
-    "as rigid+poly; repeat it for several.",
+    help="Model, such as rigid, poly, best or joint, or a hybrid such as rigid+poly; repeat it for several. "
+    "docs/models.md lists all.",
     metavar="NAME",
     kind=list[str] | None,
 )

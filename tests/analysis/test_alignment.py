@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ipsys_log.app.report.alignment_text import advise
+from ipsys_log.app.report.camera_poses import advise
 from ipsys_log.messages import CameraPoint, CameraPoints, Interval, Measurement
 from ipsys_log.statistics.alignment import LEVEL_M, Alignment, align_camera
 from ipsys_log.statistics.stationary import StationaryMarker, find_stationary

@@ -350,7 +350,6 @@ def test_impossible_input_is_refused(ipsys: Ipsys, lab: GeometricLab, fitted: Pa
     assert "does not exist" in refused(ipsys, tmp_path / "none.mcap")
     for goal in ("0", "-1", "nan", "inf", "2000"):
         assert f"--goal-mm {goal}: is not a length" in refused(ipsys, fitted, "--goal-mm", goal)
-    assert "this is the log itself" in refused(ipsys, fitted, "--plot", fitted)
     line = refused(ipsys, fitted, "--focal", "1200")
     assert line.endswith("--focal 1200: every camera has a calibration; to replace one, write black=1200")
     assert "no log is given; name a log, or give --rig lab.toml -o lab.mcap" in refused(ipsys)

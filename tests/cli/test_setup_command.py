@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 
 from ipsys_log.app.first_day.jobs import Job
-from ipsys_log.app.web.first_day.app import SetupApp
 from ipsys_log.app.web.server import PageServer
+from ipsys_log.app.web.setup import SetupApp
 from tests.conftest import Ipsys
 from tests.playing import WAIT_LIMIT_S
 

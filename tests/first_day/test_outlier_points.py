@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from ipsys_log.api import python_api as api
-from ipsys_log.app.first_day.lab_folder import LabFolder
-from ipsys_log.app.first_day.outlier_points import exclude_outlier, find_outlier_points
+from ipsys_log.app.first_day.lab_folder import LabFolder, exclude_outlier, find_outlier_points
 from ipsys_log.app.first_day.steps import Status, read_progress
 from ipsys_log.app.report.accuracy import Accuracy
 from ipsys_log.engine.output import write_messages

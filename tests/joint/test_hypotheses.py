@@ -140,6 +140,28 @@ def test_turned_camera_alone_is_accused(
     assert 0.6 < stated_deg / np.linalg.norm(turn_deg) < 1.4
 
 
+def test_turn_that_spoils_the_shape_of_the_points_is_found() -> None:
+    """The tape readings would contradict this shape, and a fit without them does not converge."""
+    settings = replace(
+        drive_of(600).settings, floor_rms_m=0.0005, wobble_deg=0.2, robot_height_sigma_m=0.0005
+    )
+    observations = turn_midway(build_lab(settings), "white", np.radians((0.14, 0.19, -0.34)), 40.7)
+    assert kinds(fit_hypotheses(observations)) == [("camera", "white")]
+
+
+@pytest.mark.parametrize("share", [0.1, 0.95])
+def test_outliers_at_one_instant_accuse_no_camera(share: float) -> None:
+    """A robot that turns back at once is not where its path is."""
+    observations = observe(drive_of(221))
+    times_s = np.unique(np.concatenate([one.times_s[one.point < 0] for one in observations.sightings]))
+    instant_s = times_s[int(share * len(times_s))]
+    moved = []
+    for one in observations.sightings:
+        is_away = (one.point < 0) & (np.abs(one.times_s - instant_s) < 0.06)
+        moved.append(replace(one, pixels=one.pixels + 30.0 * is_away[:, None, None]))
+    assert kinds(fit_hypotheses(replace(observations, sightings=tuple(moved)))) == []
+
+
 def drive_of(seed: int) -> GeometricLab:
     settings = LabSettings(seed=seed, rate_hz=10.0, drive_s=45.0, markers=1, row_time_ns=ROW_NS)
     return build_lab(GeometricSettings(lab=settings, points=6, marker_scale_sigma=0.001))

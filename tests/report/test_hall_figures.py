@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from ipsys_log.app.report.calibration_figures import clocks_figure, poses_figure
 from ipsys_log.app.report.findings import Findings
 from ipsys_log.app.report.html_figures import joint_pictures, other_residual_pictures
-from ipsys_log.app.report.points_figure import draw_hulls
+from ipsys_log.app.report.points_figures import draw_hulls
 from ipsys_log.capture.simulation.settings import grid_names
 from ipsys_log.messages import Floor
 from ipsys_log.sinks.video.composite import _arrange

@@ -18,11 +18,16 @@ from matplotlib.text import Text
 
 from ipsys_log.app.report.accuracy import Accuracy, accuracy_json
 from ipsys_log.app.report.figures import png
-from ipsys_log.app.report.files import cross_validation_csv, paper_csv
 from ipsys_log.app.report.findings import Findings
-from ipsys_log.app.report.learning_figure import learning_figure, published_figure
-from ipsys_log.app.report.paper_figures import models_figure, residuals_figure, shown_models, write_plots
-from ipsys_log.app.report.points_figure import places_figure
+from ipsys_log.app.report.paper_figures import (
+    cross_validation_csv,
+    models_figure,
+    paper_csv,
+    residuals_figure,
+    shown_models,
+    write_plots,
+)
+from ipsys_log.app.report.points_figures import learning_figure, places_figure, published_figure
 from ipsys_log.engine.output import write_log
 from ipsys_log.messages import Residual
 from ipsys_log.statistics.ground_truth import TrajectoryErrors
@@ -178,7 +183,7 @@ def test_bad_folders_are_refused_before_anything_is_done(ipsys: Ipsys, tmp_path:
         assert "--plots" in done.err
     done = ipsys("replay", log, "--model", "rigid", "--plot", log)
     assert done.code == 1
-    assert "this is the log itself" in done.err
+    assert "is not a figure file" in done.err
     assert log.read_bytes() == before
     assert (tmp_path / "file").read_text() == "mine"
     assert {path.name for path in tmp_path.iterdir()} == {"lab.mcap", "file"}

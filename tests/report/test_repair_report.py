@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from ipsys_log.app.report.repair import repair_lines
+from ipsys_log.app.report.checks import repair_lines
 from ipsys_log.log.contents import Schema
 from ipsys_log.log.reader import LogReader
 from ipsys_log.log.recovery import repair

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from ipsys_log.app.report.accuracy import Accuracy, accuracy_json, read_accuracy
-from ipsys_log.app.report.files import cross_validation_csv
 from ipsys_log.app.report.findings import Findings
+from ipsys_log.app.report.paper_figures import cross_validation_csv
 from ipsys_log.app.report.summary import answer_json, answer_text
 from ipsys_log.app.report.tables import models_table
 from ipsys_log.engine.output import write_log

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
-from ipsys_log.app.report.tracks_figure import DrawnTrack, draw_tracks, plot_tracks, read_drawn_tracks
+from ipsys_log.app.report.drive_figures import DrawnTrack, draw_tracks, read_drawn_tracks
 from ipsys_log.engine.output import write_log
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Message, Track, Tracks
@@ -32,8 +32,6 @@ def test_drawn_track_has_breaks_regions_and_hand_overs(tmp_path: Path) -> None:
     write_tracks(tmp_path / "drive.mcap")
     with Session([tmp_path / "drive.mcap"]) as session:
         tracks = read_drawn_tracks(session, "poly")
-        plot_tracks(session, "poly", tmp_path / "tracks.png")
-    assert (tmp_path / "tracks.png").read_bytes().startswith(b"\x89PNG")
     ada = tracks["ada"]
     assert np.isnan(ada.line_m[:, 0]).nonzero()[0].tolist() == [16]
     assert ada.hand_overs_m.tolist() == [[0.5, 2.0]]

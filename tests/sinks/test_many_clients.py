@@ -24,9 +24,10 @@ from ipsys_log.live_runs import pipeline
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import FRAME_SKIPPED, Tracks
 from ipsys_log.messages.channels import EVENTS, TRACKS
+from ipsys_log.sinks.streams import STALE_S, StreamSettings
 from ipsys_log.sinks.streams.foxglove import FoxgloveStream
-from ipsys_log.sinks.streams.poses import STALE_S
-from ipsys_log.sinks.streams.settings import StreamSettings, open_streams
+from ipsys_log.sinks.streams.opening import open_streams
+from ipsys_log.sinks.streams.poses import StreamContext, first_session
 from ipsys_log.units import NS_PER_S
 from tests.live_recordings import RATE_HZ, lenses, sent
 from tests.playing import SteppedClock, cameras, playing
@@ -132,7 +133,7 @@ def recording(lab: Path, calibration: Path, target: Path) -> Iterator[tuple[Clie
     vrpn, ros2, foxglove = (free_port() for _ in range(3))
     clients = Clients(vrpn, ros2, f"ws://127.0.0.1:{foxglove}/?token=secret")
     udp = tuple(f"127.0.0.1:{sock.getsockname()[1]}" for sock in clients.udp)
-    settings = StreamSettings(None, udp, vrpn=vrpn, ros2=ros2, foxglove=foxglove, secret="secret")
+    settings = StreamSettings(udp=udp, vrpn=vrpn, ros2=ros2, foxglove=foxglove, secret="secret")
     attached = LiveCameras(cameras(*frames), playing(frames, inf, before=clock.before), clock)
 
     def warn(kind: str, text: str) -> None:
@@ -140,7 +141,9 @@ def recording(lab: Path, calibration: Path, target: Path) -> Iterator[tuple[Clie
 
     first = first_messages(rig, lenses(lab), attached.now_ns)
     robots = {f"marker_{number}": None for number in range(10)}
-    with open_streams(settings, {_TOPIC}, clock.now_ns, warn, heights_m=robots) as streams, closing(clients):
+    number = first_session(clock.now_ns())
+    context = StreamContext(settings, {_TOPIC}, clock.now_ns, warn, number, robots)
+    with open_streams(context) as streams, closing(clients):
         clients.connect()
         (server,) = [stream for stream in streams if isinstance(stream, FoxgloveStream)]
         wait_until(

@@ -11,7 +11,8 @@ from urllib.request import Request, urlopen
 import pytest
 
 from ipsys_log.app.cli import dialog
-from ipsys_log.app.web.server import serve
+from ipsys_log.app.web.app import build_app
+from ipsys_log.app.web.server import serve_app
 from ipsys_log.errors import IpsysError
 from ipsys_log.live_runs.survey.checks import needs_baseline, read_baseline, withdrawal_of
 from ipsys_log.live_runs.survey.scene import CameraView, StationaryInterval
@@ -77,7 +78,7 @@ def test_terminal_asks_once_where_the_baseline_counts(monkeypatch: pytest.Monkey
 
 def test_page_saves_lists_and_withdraws_the_baseline() -> None:
     scene = EmptyScene(KNOWN)
-    with serve(scene, port=0) as page:
+    with serve_app(build_app(scene), port=0) as page:
         assert ask(page.url, "scene")["baseline"] == {"names": ["A", "B"], "counts": True}
         saved = ask(page.url, "baseline", {"distance": "200,3"})
         (row,) = saved["history"]["places"]

@@ -9,8 +9,9 @@ import pytest
 
 from ipsys_log.api import python_api as api
 from ipsys_log.app.first_day.lab_folder import LabFolder
-from ipsys_log.app.web.first_day.app import SetupApp
-from ipsys_log.app.web.server import serve, serve_app
+from ipsys_log.app.web.app import build_app
+from ipsys_log.app.web.server import serve_app
+from ipsys_log.app.web.setup import SetupApp
 from ipsys_log.exchange.lab_files import simulated_lab_texts, write_new
 from ipsys_log.messages import CameraModel, Model
 from tests.conftest import Unmeasured
@@ -67,7 +68,7 @@ def test_dashboard_has_no_serious_fault(browser: Phone, tmp_path: Path, size: tu
 
 @pytest.mark.parametrize("size", [PHONE, DESKTOP], ids=["phone", "desktop"])
 def test_measuring_page_has_no_serious_fault(browser: Phone, size: tuple[int, int]) -> None:
-    with serve(Recording(), port=0) as page:
+    with serve_app(build_app(Recording()), port=0) as page:
         browser.open(page.url, size)
         browser.wait("document.querySelector('#fields input')")
         check(browser, size)

@@ -25,8 +25,9 @@ from uvicorn.protocols.http.h11_impl import H11Protocol, RequestResponseCycle
 from uvicorn.server import ServerState
 
 from ipsys_log.app.cli.pages import say_faults
+from ipsys_log.app.web.app import build_app
 from ipsys_log.app.web.connections import PageLimits, derive_limits
-from ipsys_log.app.web.server import PageServer, ServerExceptions, serve
+from ipsys_log.app.web.server import PageServer, ServerExceptions, serve_app
 from ipsys_log.errors import IpsysError
 from ipsys_log.live_runs.survey.scene import CameraView
 from ipsys_log.log.dataset import Session
@@ -145,7 +146,7 @@ def test_used_private_parts_of_uvicorn_are_unchanged() -> None:
 
 @contextmanager
 def page_with(limits: PageLimits, scene: Recording | None = None) -> Iterator[tuple[Caller, PageServer]]:
-    with serve(scene or Recording(), "127.0.0.1", 0, limits) as page:
+    with serve_app(build_app(scene or Recording()), "127.0.0.1", 0, limits) as page:
         yield Caller(page.url), page
 
 
@@ -272,7 +273,7 @@ def test_fault_of_the_page_is_kept_for_the_end(capfd: pytest.CaptureFixture[str]
         raise ZeroDivisionError("a bug")
 
     scene.views = fail  # type: ignore[method-assign]
-    with serve(scene, port=0) as page:
+    with serve_app(build_app(scene), port=0) as page:
         caller = Caller(page.url)
         for _ in range(2):
             status, text, _ = caller.ask("GET", "/api/views")
@@ -308,7 +309,7 @@ def test_end_of_the_server_does_not_end_the_block(
         return self.should_exit
 
     monkeypatch.setattr(uvicorn.Server, "on_tick", tick)
-    with serve(Recording(), port=0) as page:
+    with serve_app(build_app(Recording()), port=0) as page:
         is_broken.set()
         page.thread.join(PATIENCE_S)
         assert not page.thread.is_alive()
@@ -324,7 +325,7 @@ def test_server_that_does_not_start_is_refused(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(uvicorn.Server, "startup", start)
     with (
         pytest.raises(IpsysError, match=r"the page cannot be served: OSError: .* Too many open files"),
-        serve(Recording(), port=0),
+        serve_app(build_app(Recording()), port=0),
     ):
         pass
 

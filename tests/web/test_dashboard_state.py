@@ -15,11 +15,12 @@ import simplejpeg
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ipsys_log.app.web.dashboard.feed import Feed
-from ipsys_log.app.web.dashboard.map import describe_floor, ellipse_of
+from ipsys_log.app.web.dashboard.app import Feed
+from ipsys_log.app.web.dashboard.map import describe_floor
 from ipsys_log.app.web.dashboard.pictures import shrink
 from ipsys_log.app.web.dashboard.status import RecentEvents
 from ipsys_log.messages import CameraCalibration, CameraModel, CompressedImage, Model, Pair
+from ipsys_log.sinks.video.floor_map import covariance_ellipse
 from ipsys_log.units import NS_PER_S
 from tests.stages.drawing import jpeg
 from tests.web.dashboards import (
@@ -48,17 +49,14 @@ def lab(tmp_path: Path) -> LiveLab:
 @given(st.lists(st.floats(-0.3, 0.3), min_size=4, max_size=4))
 def test_ellipse_has_the_axes_of_the_covariance(values: list[float]) -> None:
     root = np.array(values).reshape(2, 2)
-    covariance_m2 = np.diag([0.0, 0.0, 1.0])
-    covariance_m2[:2, :2] = root @ root.T
-    ellipse = ellipse_of(covariance_m2)
-    assert ellipse is not None
-    long_m, short_m, angle = ellipse
-    variances = np.linalg.eigvalsh(covariance_m2[:2, :2])[::-1]
+    covariance_m2 = root @ root.T
+    long_m, short_m, angle = covariance_ellipse(covariance_m2)
+    variances = np.linalg.eigvalsh(covariance_m2)[::-1]
     # In two dimensions, the quantile of chi-squared is -2 ln(1 - p).
     expected = np.sqrt(np.maximum(variances, 0) * -2 * math.log(0.05))
     assert np.allclose([long_m, short_m], expected, atol=1e-7)
     along = np.array([math.cos(angle), math.sin(angle)])
-    assert np.allclose(along @ covariance_m2[:2, :2] @ along, variances[0], atol=1e-9)
+    assert np.allclose(along @ covariance_m2 @ along, variances[0], atol=1e-9)
 
 
 def test_covariance_without_a_number_gives_no_ellipse(lab: LiveLab) -> None:

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from ipsys_log.app.first_day.lab_folder import LabFolder
-from ipsys_log.app.web.first_day.app import SetupApp
 from ipsys_log.app.web.server import serve_app
+from ipsys_log.app.web.setup import SetupApp
 from ipsys_log.capture.simulation.settings import grid_names
 from tests.web.contrast import low_contrasts
 from tests.web.phone import Phone

@@ -10,7 +10,8 @@ from contextlib import contextmanager
 
 import pytest
 
-from ipsys_log.app.web.server import serve
+from ipsys_log.app.web.app import build_app
+from ipsys_log.app.web.server import serve_app
 from ipsys_log.engine.request import Request
 from ipsys_log.live_runs.survey.from_log import open_finished_log
 from tests.conftest import Unmeasured
@@ -62,7 +63,7 @@ def test_every_state_of_the_page_fits_the_screen(
     browser: Phone, unmeasured: Unmeasured, size: tuple[int, int]
 ) -> None:
     log, tape = unmeasured
-    with open_finished_log(log, Request()) as scene, serve(scene, port=0) as page:
+    with open_finished_log(log, Request()) as scene, serve_app(build_app(scene), port=0) as page:
         a, b, side, height = texts_at(scene, tape, 0)
         browser.open(page.url, size)
         says(browser, "#sight", "is stationary")
@@ -104,7 +105,7 @@ def test_every_state_of_the_page_fits_the_screen(
 
 
 def test_desktop_shows_cameras_and_entry_side_by_side(browser: Phone) -> None:
-    with serve(Recording(), port=0) as page:
+    with serve_app(build_app(Recording()), port=0) as page:
         browser.open(page.url, DESKTOP)
         says(browser, "#sight", "is stationary")
         seen, entry = browser.run(
@@ -139,7 +140,7 @@ def other_program() -> Iterator[str]:
 
 
 def test_cookie_of_another_program_does_not_block_a_phone(browser: Phone) -> None:
-    with other_program() as other, serve(Recording(), "127.0.0.1", 0) as page:
+    with other_program() as other, serve_app(build_app(Recording()), "127.0.0.1", 0) as page:
         browser.open(other)
         browser.open(page.url)
         assert browser.run("location.pathname + location.search") == "/"

@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from ipsys_log.app.first_day.lab_folder import LabFolder
-from ipsys_log.app.web.first_day.app import SetupApp
 from ipsys_log.app.web.server import serve_app
+from ipsys_log.app.web.setup import SetupApp
 from ipsys_log.exchange.lab_files import simulated_lab_texts, write_new
 from ipsys_log.log.dataset import Session
 from tests.capture.nodes.tcp_relay import Relay

@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ipsys_log.app.web.server import serve
+from ipsys_log.app.web.app import build_app
+from ipsys_log.app.web.server import serve_app
 from ipsys_log.engine.request import Request
 from ipsys_log.errors import LogError
 from ipsys_log.live_runs.survey.from_log import FinishedLog, open_finished_log
@@ -68,7 +69,7 @@ def texts_at(scene: FinishedLog, tape: Sequence[Measurement], number: int) -> tu
 @pytest.mark.slow
 def test_point_is_typed_checked_saved_and_withdrawn(hand: Phone, unmeasured: Unmeasured) -> None:
     log, tape = unmeasured
-    with open_finished_log(log, Request()) as scene, serve(scene, port=0) as page:
+    with open_finished_log(log, Request()) as scene, serve_app(build_app(scene), port=0) as page:
         a, b, side, height = texts_at(scene, tape, 0)
         hand.open(page.url)
         says(hand, "#sight", "is stationary, seen by")
@@ -114,7 +115,7 @@ def test_side_is_chosen_on_the_map_and_checked_by_the_model(
     log, tape = unmeasured
     assert ipsys("fit", lab, "--model", "rigid").code == 0
     assert ipsys("fit", log, "--model-from", lab, "--model", "rigid").code == 0
-    with open_finished_log(log, Request()) as scene, serve(scene, port=0) as page:
+    with open_finished_log(log, Request()) as scene, serve_app(build_app(scene), port=0) as page:
         assert scene.model is not None
         a, b, side, height = texts_at(scene, tape, 0)
         hand.open(page.url)
@@ -136,7 +137,7 @@ def test_side_is_chosen_on_the_map_and_checked_by_the_model(
 @pytest.mark.slow
 def test_log_errors_are_shown_on_the_page(hand: Phone, unmeasured: Unmeasured) -> None:
     log, tape = unmeasured
-    with open_finished_log(log, Request()) as scene, serve(scene, port=0) as page:
+    with open_finished_log(log, Request()) as scene, serve_app(build_app(scene), port=0) as page:
         a, b, side, height = texts_at(scene, tape, 0)
         hand.open(page.url)
         says(hand, "#sight", "is stationary")
@@ -159,7 +160,7 @@ def test_second_process_measures_in_the_same_log(hand: Phone, unmeasured: Unmeas
     log, tape = unmeasured
     with (
         open_finished_log(log, Request()) as scene,
-        serve(scene, port=0) as page,
+        serve_app(build_app(scene), port=0) as page,
         open_finished_log(log, Request()) as other,
     ):
         texts = texts_at(scene, tape, 0)
@@ -217,7 +218,7 @@ class Recording:
 def test_moving_marker_cannot_be_saved_during_a_recording(hand: Phone) -> None:
     scene = Recording()
     scene.speed_m = 0.02
-    with serve(scene, port=0) as page:
+    with serve_app(build_app(scene), port=0) as page:
         hand.open(page.url)
         says(hand, "#sight", "Marker 0 moves, as seen by red")
         fill(hand, "170", "190", "left", "10")
@@ -247,7 +248,7 @@ SEEN = """(e => {{ const b = e.getBoundingClientRect();
 @pytest.mark.slow
 def test_save_button_shows_the_point_to_save(hand: Phone) -> None:
     scene = Recording()
-    with serve(scene, port=0) as page:
+    with serve_app(build_app(scene), port=0) as page:
         hand.open(page.url)
         says(hand, "#sight", "Marker 0 is stationary")
         hand.type("#d-A", "152 cm")
@@ -289,7 +290,7 @@ def test_cameras_show_visible_markers_before_a_choice(hand: Phone) -> None:
         CameraView("white", 1, None, Markers(1, (), 960, 540)),
     ]
     scene.views = lambda interval: views  # type: ignore[method-assign]
-    with serve(scene, port=0) as page:
+    with serve_app(build_app(scene), port=0) as page:
         hand.open(page.url)
         says(hand, "#sight", "Choose the marker: 0, 3 are visible")
         says(hand, "#cameras button:nth-child(1) span", "sees 0, 3")
@@ -305,7 +306,7 @@ def test_two_distances_need_the_side_and_three_show_residuals(hand: Phone) -> No
     scene = Recording()
     third = ReferencePoint("C", 2.4, 0.3)
     scene.rig = replace(labs.RIG, reference_points=(*labs.RIG.reference_points, third))
-    with serve(scene, port=0) as page:
+    with serve_app(build_app(scene), port=0) as page:
         hand.open(page.url)
         says(hand, "#sight", "Marker 0 is stationary, seen by red")
         hand.wait("document.querySelector('#sides').hidden")
@@ -324,7 +325,7 @@ def test_two_distances_need_the_side_and_three_show_residuals(hand: Phone) -> No
 @pytest.mark.slow
 def test_points_are_measured_in_turn_with_a_token(hand: Phone, unmeasured: Unmeasured) -> None:
     log, tape = unmeasured
-    with open_finished_log(log, Request()) as scene, serve(scene, "127.0.0.1", 0) as page:
+    with open_finished_log(log, Request()) as scene, serve_app(build_app(scene), "127.0.0.1", 0) as page:
         hand.open(page.url)
         # The token disappears from the address after its use.
         assert hand.run("location.pathname + location.search") == "/"

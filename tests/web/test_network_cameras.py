@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from ipsys_log.app.first_day.lab_folder import LabFolder
-from ipsys_log.app.web.first_day.app import SetupApp
 from ipsys_log.app.web.server import serve_app
+from ipsys_log.app.web.setup import SetupApp
 from ipsys_log.capture.nodes import centre
 from ipsys_log.capture.nodes.network import NodeNetwork
 from ipsys_log.messages.rig_file import load_rig

@@ -11,8 +11,8 @@ import pytest
 
 from ipsys_log.app.first_day.lab_folder import LabFolder
 from ipsys_log.app.first_day.steps import Status, read_progress
-from ipsys_log.app.web.first_day.app import SetupApp
 from ipsys_log.app.web.server import serve_app
+from ipsys_log.app.web.setup import SetupApp
 from tests.cli.test_simulated_day import errors_m
 from tests.web.contrast import low_contrasts
 from tests.web.phone import Phone

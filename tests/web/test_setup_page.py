@@ -14,8 +14,8 @@ import pytest
 
 from ipsys_log.app.first_day.jobs import Job
 from ipsys_log.app.first_day.lab_folder import LabFolder
-from ipsys_log.app.web.first_day.app import SetupApp
 from ipsys_log.app.web.server import serve_app
+from ipsys_log.app.web.setup import SetupApp
 from ipsys_log.messages.rig_file import load_rig
 from tests.playing import WAIT_LIMIT_S
 from tests.waiting import wait_until

@@ -17,19 +17,16 @@ from ipsys_log.app.cli import batch
 from ipsys_log.app.cli.calibrate import calibrate
 from ipsys_log.app.cli.calibrate_lab import calibrate_lab
 from ipsys_log.app.cli.camera_poses import align, drift
-from ipsys_log.app.cli.checks import check, repair, verify
 from ipsys_log.app.cli.console import remarks, say
-from ipsys_log.app.cli.contents import cat, info
 from ipsys_log.app.cli.datasets import catalogue, pack, score
 from ipsys_log.app.cli.imports import KINDS, import_
 from ipsys_log.app.cli.log_copies import cut, merge
-from ipsys_log.app.cli.markers import markers
-from ipsys_log.app.cli.measure import exclude, measure
+from ipsys_log.app.cli.logs import cat, check, info, repair, verify
 from ipsys_log.app.cli.node import node
 from ipsys_log.app.cli.options import needs_local_files
-from ipsys_log.app.cli.plan import plan
+from ipsys_log.app.cli.points import exclude, measure, plan
 from ipsys_log.app.cli.record import live, record
-from ipsys_log.app.cli.setup import cameras, init, setup
+from ipsys_log.app.cli.setup import cameras, init, markers, setup
 from ipsys_log.app.cli.signals import interruptible
 from ipsys_log.app.cli.simulated import drive, simulate
 from ipsys_log.app.cli.stages import STAGE_NAMES, evaluate, replay
@@ -185,10 +182,7 @@ for group, commands in {**_FIRST, **_FURTHER}.items():
         text, _, examples = cleandoc(command.__doc__ or "").partition("\n\nExamples\n\n")
         EXAMPLES[_name(command)] = cleandoc(examples).splitlines()
         app.command(
-            _name(command),
-            help=_unwrapped(text),
-            epilog=f"Examples\n\n{examples}",
-            rich_help_panel=group,
+            _name(command), help=_unwrapped(text), epilog=f"Examples\n\n{examples}", rich_help_panel=group
         )(_wrapped(command))
 batch.add_commands(app, _BATCH, _wrapped)
 

@@ -5,31 +5,28 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.text import Text
 
-from ipsys_log.app.cli.console import console, print_json, remarks, say
-from ipsys_log.app.cli.options import (
-    REQUIRED,
-    AsJson,
-    LogList,
-    Option,
-    check_present,
-    flag,
-    log_argument,
-    option,
-)
+from ipsys_log.app.cli import options as cli
+from ipsys_log.app.cli.console import print_result, remarks, say
+from ipsys_log.app.cli.options import check_present, flag, log_argument, option, with_options
 from ipsys_log.app.cli.signals import say_kept
-from ipsys_log.app.cli.stages import build_command, options_until, replay_options
+from ipsys_log.app.cli.stages import options_until, replay_options
+from ipsys_log.app.report.files import check_file, check_parquet_name
+from ipsys_log.errors import IpsysError
+from ipsys_log.extras import check_installed
+from ipsys_log.log.location import LogLocation
 
 if TYPE_CHECKING:
     from rich.progress import TaskID
 
     from ipsys_log.api.batch.tasks import BatchTask, LogResult
     from ipsys_log.api.batch.workers import WorkerSettings
-    from ipsys_log.log.location import LogLocation
 
 _MORE = "\n\nA log that fails does not affect the others. The exit code is 1 if a log failed."
 _KEPT = "complete results are kept; nothing else is changed"
@@ -46,7 +43,7 @@ _DERIVED = (
     "is read together with its derived log. Default: the working folder."
 )
 _LOGS = Annotated[
-    LogList,
+    cli.LogList,
     log_argument(
         help="Logs, files or URLs, each one on its own. A folder, or a URL that ends with /, stands for all "
         "logs below it."
@@ -58,7 +55,7 @@ _OUTPUT = option(
     "working folder.",
 )  # fmt: skip
 # The options of the workers and of the result, which all commands of the group have.
-_WORKERS: dict[str, Option] = {
+_WORKERS: dict[str, cli.Option] = {
     "scheduler": option(
         str | None, "--scheduler", "ADDRESS",
         "Use the workers of this Dask scheduler, such as tls://head:8786. Access to a scheduler means code "
@@ -80,14 +77,14 @@ _WORKERS: dict[str, Option] = {
     "table": option(
         Path | None, "--table", "FILE", "Write the results to a Parquet file: a row for each log."
     ),
-    "as_json": (AsJson, False),
+    "as_json": (cli.AsJson, False),
 }  # fmt: skip
-_EXPORT: dict[str, Option] = {
+_EXPORT: dict[str, cli.Option] = {
     "output": option(
         Path, "--output,-o", "FOLDER",
         "The folder for the files, named as the logs. They keep the folders of the logs below the folder or "
         "pattern that you name.",
-        REQUIRED,
+        cli.REQUIRED,
     ),
     "format_": option(str, "--format", "NAME", "csv, parquet, tum, kitti, ros2, mp4 or coco.", "csv"),
     "channel": option(
@@ -112,9 +109,9 @@ def add_commands(
         no_args_is_help=True,
     )
 
-    def add(name: str, text: str, work: Callable[..., None], options: dict[str, Option]) -> None:
-        options = {"logs": (_LOGS, REQUIRED), **options, **_WORKERS}
-        group.command(name, help=text)(wrap(build_command(name, text, options, work)))
+    def add(name: str, text: str, work: Callable[..., None], options: dict[str, cli.Option]) -> None:
+        options = {"logs": (_LOGS, cli.REQUIRED), **options, **_WORKERS}
+        group.command(name, help=text)(wrap(with_options(options, name, text)(work)))
 
     derived = option(Path | None, "--derived,-o", "FOLDER", _DERIVED)
     outdated = flag("--outdated", "Replay only logs that hold outdated runs.")
@@ -123,7 +120,7 @@ def add_commands(
     add("replay", text, _replay, {**_stage_options(None), "output": _OUTPUT, "outdated": outdated})
     text = "Evaluate models on each log, and append the evaluations to it. The catalogue collects the errors."
     text += _MORE + _REPEAT
-    add("evaluate", text, _evaluate, {**_stage_options("evaluate"), "output": _OUTPUT})
+    add("evaluate", text, partial(_replay, "evaluate"), {**_stage_options("evaluate"), "output": _OUTPUT})
     text = "Compute every run of each log again, and compare it byte for byte." + _MORE
     add("verify", text, _verify, {"run": run, "derived": derived})
     add("check", "Read each log completely and check it." + _MORE, _check, {"derived": derived})
@@ -136,33 +133,23 @@ def add_commands(
     app.add_typer(group, name="batch", rich_help_panel=panel)
 
 
-def _stage_options(until: str | None) -> dict[str, Option]:
+def _stage_options(until: str | None) -> dict[str, cli.Option]:
     left_out = ("logs", "output", "jobs", "as_json")
     return {name: option for name, option in options_until(until).items() if name not in left_out}
 
 
-def _replay(outdated: bool, **given: Any) -> None:
-    _replay_each(given, outdated=outdated)
-
-
-def _evaluate(**given: Any) -> None:
-    _replay_each(given, until="evaluate")
-
-
-def _replay_each(given: dict[str, Any], **further: Any) -> None:
+def _replay(until: str | None = None, outdated: bool = False, **given: Any) -> None:
     from ipsys_log.api.batch.log_work import replay_log
     from ipsys_log.api.batch.tasks import BatchTask
 
     options, batch = _divide(given)
     folder = _result_folder(options.pop("output"), "-o")
-    work = {**further, "folder": folder, **_replay_options(options)}
+    work = {"until": until, "outdated": outdated, "folder": folder, **_replay_options(options)}
     _run(BatchTask(replay_log, work, divides=True), **batch)
 
 
 def _result_folder(folder: Path | None, option: str) -> Path:
     """Return the folder for derived logs, as workers with other working folders name it."""
-    from ipsys_log.errors import IpsysError
-
     if folder is not None and folder.exists() and not folder.is_dir():
         raise IpsysError(f"{option} {folder}: is not a folder; name a folder for the results")
     return (folder or Path()).absolute()
@@ -214,7 +201,6 @@ def _divide(given: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
 def _replay_options(options: dict[str, Any]) -> dict[str, Any]:
     """Return the options as those of `python_api.replay`; rig and intrinsics are read once."""
     from ipsys_log.app.cli.lab_inputs import load_calibrations, split_calibration
-    from ipsys_log.errors import IpsysError
     from ipsys_log.messages.rig_file import load_rig
     from ipsys_log.models.table import check_name
 
@@ -251,8 +237,6 @@ def _run(
     paths : the logs of the folders and patterns in ``logs``; None: they are searched here.
     """
     from ipsys_log.api.batch.workers import WorkerSettings
-    from ipsys_log.app.report.files import check_file, check_parquet_name
-    from ipsys_log.extras import check_installed
     from ipsys_log.log.log_files import expand_folders
 
     check_installed("batch needs", "dask", "distributed", "bokeh", "cryptography")
@@ -299,12 +283,8 @@ def _collect(task: BatchTask, paths: Sequence[LogLocation], settings: WorkerSett
 def _print(results: Sequence[LogResult], table: Path | None, as_json: bool) -> None:
     from ipsys_log.app.report.batch import batch_json, batch_table, failure_lines, write_results
 
-    if as_json:
-        print_json(batch_json(results))
-    else:
-        console.print(batch_table(results))
-        for line in failure_lines(results):
-            console.print(line, style="red")
+    failures = (Text(line, "red") for line in failure_lines(results))
+    print_result(batch_json(results), (batch_table(results), *failures), as_json)
     for trace in {result.trace for result in results if result.trace}:
         say(trace)
     if table is not None:

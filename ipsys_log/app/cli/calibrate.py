@@ -12,82 +12,70 @@ import typer
 
 from ipsys_log.app.cli.console import console, print_json, progress_bar, say, warn
 from ipsys_log.app.cli.open_cameras import SENT_NOW, prepare_lab, record_now
-from ipsys_log.app.cli.options import AsJson, file_log_argument
+from ipsys_log.app.cli.options import AsJson, figure_option, file_log_argument, setting, switch
 from ipsys_log.app.cli.signals import note_kept, say_kept
+from ipsys_log.app.report.files import check_file, check_folder, write_files
+from ipsys_log.errors import IpsysError
 
 if TYPE_CHECKING:
     from ipsys_log.calibration.calibrate import CalibrationResult, Failure
     from ipsys_log.capture.lab import Lab
 
 Sources = Annotated[
-    list[Path] | None,
-    file_log_argument(help="Logs, folders of images, images or videos.", metavar="SOURCE"),
+    list[Path] | None, file_log_argument(help="Logs, folders of images, images or videos.", metavar="SOURCE")
 ]
-RigNow = Annotated[
-    Path | None,
-    typer.Option("--rig", metavar="FILE", help="Without SOURCE: use the cameras of this rig now."),
-]
+RigNow = Annotated[Path | None, setting("--rig", "FILE", "Without SOURCE: use the cameras of this rig now.")]
 Seconds = Annotated[
-    float,
-    typer.Option(min=1.0, metavar="SECONDS", help="Without SOURCE: duration, while you move the board."),
+    float, setting("--seconds", "SECONDS", "Without SOURCE: duration, while you move the board.", min=1.0)
 ]
 BoardName = Annotated[
     str,
-    typer.Option(
-        metavar="COLUMNSxROWS",
-        help="Inner corners of a chessboard, such as 6x4, or squares of a ChArUco board, such as "
-        "charuco:4x5.",
+    setting(
+        "--board",
+        "COLUMNSxROWS",
+        "Inner corners of a chessboard, such as 6x4, or squares of a ChArUco board, such as charuco:4x5.",
     ),
 ]
 Square = Annotated[
-    float, typer.Option(metavar="METRES", help="Side of a square, in m. It does not change the intrinsics.")
+    float, setting("--square", "METRES", "Side of a square, in m. It does not change the intrinsics.")
 ]
 MarkerScale = Annotated[
     float,
-    typer.Option(metavar="SHARE", help="Side of a ChArUco marker, as a fraction of the side of a square."),
+    setting("--marker-scale", "SHARE", "Side of a ChArUco marker, as a fraction of the side of a square."),
 ]
-Dictionary = Annotated[
-    str, typer.Option(metavar="NAME", help="Dictionary of the markers of a ChArUco board.")
-]
-Inverted = Annotated[bool, typer.Option("--inverted", help="The board has black and white exchanged.")]
+Dictionary = Annotated[str, setting("--dictionary", "NAME", "Dictionary of the markers of a ChArUco board.")]
+Inverted = Annotated[bool, switch("--inverted", "The board has black and white exchanged.")]
 Lens = Annotated[
     str,
-    typer.Option(
-        metavar="NAME",
-        help="Distortion model: fisheye (Kannala-Brandt, k1 to k4), pinhole (k1 k2 p1 p2 k3), pinhole4 "
+    setting(
+        "--lens",
+        "NAME",
+        "Distortion model: fisheye (Kannala-Brandt, k1 to k4), pinhole (k1 k2 p1 p2 k3), pinhole4 "
         "(without k3) or pinhole8 (with k4 k5 k6).",
     ),
 ]
 Cameras = Annotated[
     list[str] | None,
-    typer.Option(
-        metavar="CAMERA",
-        help="Use only this camera of the log or rig; repeat it for several. With images or a video: the "
+    setting(
+        "--camera",
+        "CAMERA",
+        "Use only this camera of the log or rig; repeat it for several. With images or a video: the "
         "name of the camera.",
     ),
 ]
 Output = Annotated[
-    Path,
-    typer.Option(
-        "--output", "-o", metavar="PATH", help="Folder of the files, or one file, such as red.yaml."
-    ),
+    Path, setting("--output,-o", "PATH", "Folder of the files, or one file, such as red.yaml.")
 ]
 Formats = Annotated[
     list[str] | None,
-    typer.Option(
-        "--format",
-        metavar="NAME",
-        help="File format: opencv (the default), ros or kalibr; repeat it for several.",
-    ),
+    setting("--format", "NAME", "File format: opencv (the default), ros or kalibr; repeat it for several."),
 ]
-Plot = Annotated[
-    Path | None, typer.Option(metavar="FILE", help="Draw coverage and residuals: .png, .pdf, .svg or .jpg.")
-]
+Plot = Annotated[Path | None, figure_option("coverage and residuals")]
 Force = Annotated[
     bool,
-    typer.Option(
+    switch(
         "--force",
-        help="Write a result that a check refuses: the file exists; most images show a larger board than "
+        "Write a result that a check refuses: the file exists; most images show a larger board than "
         "--board; RMS above 2 px; fewer than 5 images; images of two cameras.",
     ),
 ]
@@ -124,7 +112,6 @@ def calibrate(
         ipsys calibrate red.mp4 --board charuco:4x5 --camera red --plot red.png
     """
     from ipsys_log.api import python_api as api
-    from ipsys_log.app.report.files import check_figure_file
     from ipsys_log.calibration.board import parse_board
     from ipsys_log.calibration.calibrate import CalibrationResult
     from ipsys_log.calibration.images import find_sources
@@ -137,7 +124,6 @@ def calibrate(
     for name in names:
         check_format(name, lens)
     if plot is not None:
-        check_figure_file(plot, "--plot", sources or [])
         _check_free(plot, force)
     lab = None if sources else _prepare_now(rig, camera, board)
     if lab is not None:
@@ -167,7 +153,10 @@ def calibrate(
                     outcomes.append(outcome._replace(reason=reason))
     lenses = [outcome for outcome in outcomes if isinstance(outcome, CalibrationResult)]
     if plot is not None and lenses:
-        _draw(lenses, plot)
+        from ipsys_log.app.report.calibration_figures import calibration_figure
+        from ipsys_log.app.report.figures import save_figure
+
+        save_figure(calibration_figure(lenses), plot, 110)
     _print_outcomes(outcomes, targets, plot, as_json, for_rig="opencv" in names)
 
 
@@ -180,7 +169,6 @@ def _print_outcomes(
 ) -> None:
     """Print the results, then a line for each camera without a result; exit with 1 if a result is missing."""
     from ipsys_log.calibration.calibrate import Failure
-    from ipsys_log.errors import IpsysError
 
     failures = [outcome for outcome in outcomes if isinstance(outcome, Failure)]
     if len(failures) == len(outcomes) == 1:
@@ -211,7 +199,6 @@ def _json(outcome: CalibrationResult | Failure, targets: dict[str, dict[str, Pat
 def _prepare_now(rig: Path | None, only: list[str] | None, board: str) -> Lab:
     """Return the cameras to calibrate; simulated ones show the calibration board."""
     from ipsys_log.capture.simulated import show_board
-    from ipsys_log.errors import IpsysError
 
     if rig is None:
         raise IpsysError(
@@ -234,8 +221,6 @@ def _record_now(lab: Lab, seconds: float) -> Iterator[list[Path]]:
 
 def _targets(cameras: list[str], output: Path, formats: list[str], force: bool) -> dict[str, dict[str, Path]]:
     """Return the path of the file of each camera and format; raise if it cannot be written."""
-    from ipsys_log.app.report.files import check_file, check_folder
-    from ipsys_log.errors import IpsysError
     from ipsys_log.exchange.calibration_files import FORMATS
 
     if output.suffix.lower() in (".yaml", ".yml"):
@@ -256,7 +241,6 @@ def _targets(cameras: list[str], output: Path, formats: list[str], force: bool) 
 
 
 def _check_free(path: Path, force: bool) -> None:
-    from ipsys_log.errors import IpsysError
     from ipsys_log.log.location import describe_broken_link
 
     if (text := describe_broken_link(path)) is not None:
@@ -267,21 +251,12 @@ def _check_free(path: Path, force: bool) -> None:
 
 def _write(one: CalibrationResult, paths: dict[str, Path]) -> None:
     """Write the files of a camera, one for each format."""
-    from ipsys_log.app.report.files import write_files
     from ipsys_log.exchange.calibration_files import calibration_text
 
     contents = {path: calibration_text(one, name).encode() for name, path in paths.items()}
     for folder in dict.fromkeys(path.parent for path in contents):
         write_files(folder, {path.name: data for path, data in contents.items() if path.parent == folder})
         note_kept(", ".join(str(path) for path in contents if path.parent == folder))
-
-
-def _draw(lenses: list[CalibrationResult], plot: Path) -> None:
-    from ipsys_log.app.report.calibration_figures import calibration_figure
-    from ipsys_log.app.report.figures import figure_bytes
-    from ipsys_log.app.report.files import write_files
-
-    write_files(plot.parent, {plot.name: figure_bytes(calibration_figure(lenses), plot, 110)})
 
 
 def _show(one: CalibrationResult, files: list[Path], for_rig: bool) -> None:

@@ -8,80 +8,48 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
-from ipsys_log.app.cli.console import console, print_json, progress_bar, say, warn
-from ipsys_log.app.cli.lab_inputs import (
-    FieldOfView,
-    Focal,
-    SaveNominal,
-    cameras_of,
-    lab_of_run,
-    load_calibrations,
-    load_matching_rig,
-    nominal_lenses,
-    nominal_lenses_of_logs,
-    write_nominal,
-)
+from ipsys_log.app.cli import lab_inputs
+from ipsys_log.app.cli import options as cli
+from ipsys_log.app.cli.console import print_result, progress_bar, say
 from ipsys_log.app.cli.open_cameras import check_target, open_cameras, prepare_lab
-from ipsys_log.app.cli.options import (
-    AsJson,
-    Calibrations,
-    Corners,
-    Force,
-    Host,
-    NoLogs,
-    Port,
-    RigFile,
-    log_argument,
-    log_option,
-)
+from ipsys_log.app.cli.options import figure_option, log_argument, log_option, setting, switch
 from ipsys_log.app.cli.record import live_scene, ready_to_measure, serve_live_measuring
 from ipsys_log.app.cli.stages import derive
+from ipsys_log.errors import IpsysError
+from ipsys_log.extras import check_installed
+from ipsys_log.log.location import LogLocation
 
 if TYPE_CHECKING:
     from ipsys_log.engine.request import Request
     from ipsys_log.live_runs.survey.lab_calibration import LabCalibration
-    from ipsys_log.log.location import LogLocation
     from ipsys_log.messages import Rig
     from ipsys_log.sinks.sink import Sink
 
 # Largest goal that still means something, in mm.
 _MOST_GOAL_MM = 1000.0
 
-Goal = Annotated[
-    float,
-    typer.Option("--goal-mm", metavar="MM", help="Wanted mean error over the floor of each camera, in mm."),
-]
-Train = Annotated[str, typer.Option(metavar="LABEL", help="Fit on the measurements with this label.")]
+Goal = Annotated[float, setting("--goal-mm", "MM", "Wanted mean error over the floor of each camera, in mm.")]
 Output = Annotated[
     Path | None,
     log_option(help="Write the results to a new log, not to the last LOG. Without LOG: the log to record."),
 ]
-Plot = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="FILE",
-        help="Draw the expected error over the floor of each camera: .png, .pdf, .svg or .jpg.",
-    ),
-]
+Plot = Annotated[Path | None, figure_option("the expected error over the floor of each camera")]
 
 Sources = Annotated[
-    NoLogs,
+    cli.NoLogs,
     log_argument(
         help="Logs, files or URLs, read as one session. The last log gets the results. Without LOG: use the "
-        "cameras of --rig now.",
+        "cameras of --rig now."
     ),
 ]
 Seconds = Annotated[
-    float | None,
-    typer.Option(min=1.0, metavar="SECONDS", help="Without LOG: stop the cameras after this time."),
+    float | None, setting("--seconds", "SECONDS", "Without LOG: stop the cameras after this time.", min=1.0)
 ]
 Terminal = Annotated[
     bool,
-    typer.Option(
+    switch(
         "--terminal",
-        help="Without LOG: ask for the measured points in the terminal after the drive, not on a page.",
+        "Without LOG: ask for the measured points in the terminal after the drive, not on a page.",
     ),
 ]
 _LEAST_POINTS = 2
@@ -90,21 +58,21 @@ _LEAST_POINTS = 2
 def calibrate_lab(
     logs: Sources = None,
     goal_mm: Goal = 3.0,
-    focal: Focal = None,
-    field_of_view: FieldOfView = None,
-    train: Train = "train",
-    rig: RigFile = None,
-    calibration: Calibrations = None,
-    corners: Corners = None,
+    focal: lab_inputs.Focal = None,
+    field_of_view: lab_inputs.FieldOfView = None,
+    train: cli.Train = "train",
+    rig: cli.RigFile = None,
+    calibration: cli.Calibrations = None,
+    corners: cli.Corners = None,
     output: Output = None,
     plot: Plot = None,
-    save_nominal: SaveNominal = None,
+    save_nominal: lab_inputs.SaveNominal = None,
     seconds: Seconds = None,
     terminal: Terminal = False,
-    host: Host = None,
-    port: Port = 8000,
-    force: Force = False,
-    as_json: AsJson = False,
+    host: cli.Host = None,
+    port: cli.Port = 8000,
+    force: cli.Force = False,
+    as_json: cli.AsJson = False,
 ) -> None:
     """Calibrate all cameras of a lab together, from drives of robots and a few measured points.
 
@@ -121,54 +89,39 @@ def calibrate_lab(
         ipsys calibrate-lab lab.mcap --goal-mm 2           # is 2 mm reached?
         ipsys calibrate-lab lab.mcap --field-of-view 105   # without a chessboard
     """
-    from ipsys_log.app.report.files import check_figure_file
     from ipsys_log.engine.graph import writes
-    from ipsys_log.errors import IpsysError
+    from ipsys_log.engine.request import Request
     from ipsys_log.live_runs.survey.lab_calibration import describe_lab
     from ipsys_log.messages.channels import MODEL
 
     if not 0 < goal_mm <= _MOST_GOAL_MM:
         raise IpsysError(f"--goal-mm {goal_mm:g}: is not a length above 0 and up to {_MOST_GOAL_MM:g} mm")
-    if plot is not None:
-        check_figure_file(plot, "--plot", logs or [])
+    nominal = [("--focal", text) for text in focal or []]
+    nominal += [("--field-of-view", text) for text in field_of_view or []]
     if logs:
-        _refuse_live(seconds=seconds, terminal=terminal, host=host, force=force)
+        for name, value in {"seconds": seconds, "terminal": terminal, "host": host, "force": force}.items():
+            if value:
+                raise IpsysError(f"--{name} is only for live cameras; leave out LOG or this option")
     else:
         if output is None:
             raise IpsysError("no log is given; name a log, or give --rig lab.toml -o lab.mcap to use cameras")
-        nominal = [("--focal", text) for text in focal or []]
-        nominal += [("--field-of-view", text) for text in field_of_view or []]
         page = None if terminal else (host, port)
-        _record_drive(
-            output,
-            rig or Path("lab.toml"),
-            calibration,
-            nominal,
-            corners,
-            goal_mm / 1000,
-            seconds,
-            page,
-            force,
-        )
+        request, goal_m = Request(corners=corners), goal_mm / 1000
+        _record_drive(output, rig, calibration, nominal, request, goal_m, seconds, page, force)
         # The log has the rig and the intrinsics of its cameras.
-        logs, output, rig, calibration, focal, field_of_view = [output], None, None, None, None, None
-    given_rig = load_matching_rig(rig, lambda: cameras_of(logs))
+        logs, output, rig, calibration, nominal = [output], None, None, None, []
+    given_rig = lab_inputs.load_matching_rig(rig, lambda: lab_inputs.cameras_of(logs))
     _check(logs, given_rig)
-    lenses = load_calibrations(calibration, lambda: cameras_of(logs))
-    nominal_values = nominal_lenses_of_logs(logs, lenses, focal or [], field_of_view or [])
+    lenses = lab_inputs.load_calibrations(calibration, lambda: lab_inputs.cameras_of(logs))
+    nominal_values = lab_inputs.nominal_lenses_of_logs(logs, lenses, nominal)
     if save_nominal is not None:
-        write_nominal(nominal_values, save_nominal)
+        lab_inputs.write_nominal(nominal_values, save_nominal)
     lenses = {**lenses, **nominal_values}
-    options: dict[str, Any] = {
-        "train": train,
-        "rig": rig,
-        "calibration": None,
-        "corners": corners,
-        "run": None,
-    }
-    with derive(logs, "fit", output, model=["joint"], lenses=lenses, **options) as (session, outcomes, _):
+    given: dict[str, Any] = {"model": ["joint"], "lenses": lenses, "train": train}
+    given |= {"rig": rig, "calibration": None, "corners": corners, "run": None}
+    with derive(logs, "fit", output, **given) as (session, outcomes, _):
         run = next(outcome.run for outcome in reversed(outcomes) if writes(outcome, MODEL))
-        in_force, all_lenses = lab_of_run(session, run, given_rig, lenses)
+        in_force, all_lenses = lab_inputs.lab_of_run(session, run, given_rig, lenses)
         with progress_bar() as progress:
             lab = describe_lab(
                 session, run, in_force, all_lenses, (given_rig, lenses), train, goal_mm / 1000,
@@ -180,7 +133,6 @@ def calibrate_lab(
 def _check(logs: Sequence[LogLocation], rig: Rig | None) -> None:
     """Check that the logs have a rig and a marker or an image, before any stage runs."""
     from ipsys_log.engine.provenance import newest_run
-    from ipsys_log.errors import IpsysError
     from ipsys_log.log.dataset import Session
     from ipsys_log.messages.channels import MARKERS, RIG
 
@@ -195,43 +147,24 @@ def _check(logs: Sequence[LogLocation], rig: Rig | None) -> None:
             )
 
 
-def _refuse_live(**options: object) -> None:
-    """Refuse options that belong to a recording."""
-    from ipsys_log.errors import IpsysError
-
-    for name, value in options.items():
-        if value:
-            raise IpsysError(f"--{name} is only for live cameras; leave out LOG or this option")
-
-
 def _show(lab: LabCalibration, plot: Path | None, as_json: bool) -> None:
-    from ipsys_log.app.report.expected_error_texts import lab_advice, lab_headline, lab_json, lab_table
+    from ipsys_log.app.report.calibration import lab_advice, lab_headline, lab_json, lab_table
 
+    parts = (*lab_headline(lab), "", lab_table(lab), *lab_advice(lab))
+    print_result(lab_json(lab), parts, as_json, lab.notes)
     if plot is not None:
         from ipsys_log.app.report.expected_error_figures import draw_lab
 
         draw_lab(lab, plot)
-    if as_json:
-        print_json(lab_json(lab))
-    else:
-        for line in lab_headline(lab):
-            console.print(line)
-        console.print()
-        console.print(lab_table(lab))
-        for line in lab_advice(lab):
-            console.print(line)
-    for note in lab.notes:
-        warn(note)
-    if plot is not None:
         say(f"{plot} drawn")
 
 
 def _record_drive(
     output: Path,
-    rig: Path,
+    rig: Path | None,
     calibration: list[str] | None,
     nominal: Sequence[tuple[str, str]],
-    corners: str | None,
+    request: Request,
     goal_m: float,
     seconds: float | None,
     page: tuple[str | None, int] | None,
@@ -241,27 +174,19 @@ def _record_drive(
 
     Parameters
     ----------
-    output : the new log.
-    rig, calibration : files of the rig and of intrinsics.
     nominal : options for nominal intrinsics, with their texts.
-    corners : method of the corners.
     goal_m : wanted mean error of every camera.
-    seconds : duration; None: until a signal.
     page : address and port of the measuring page; None: the terminal asks after the recording.
-    force : overwrite an existing log.
     """
-    from ipsys_log.engine.request import Request
-    from ipsys_log.extras import check_installed
     from ipsys_log.live_runs import pipeline
     from ipsys_log.live_runs.survey.live_calibration import LiveCalibration
 
     if page is not None:
         check_installed("the measuring page needs", "starlette", "uvicorn")
-    lab = prepare_lab(rig, None, calibration)
+    lab = prepare_lab(rig or Path("lab.toml"), None, calibration)
     sizes_px = {c.name: (c.width, c.height) for c in lab.cameras if c.width and c.height}
-    lab.lenses.update(nominal_lenses(nominal, lab.names, lab.lenses, sizes_px))
+    lab.lenses.update(lab_inputs.nominal_lenses(nominal, lab.names, lab.lenses, sizes_px))
     check_target(output, force, lab.files)
-    request = Request(corners=corners)
     ready_to_measure(lab, request, None, page)
     with open_cameras(lab, output, seconds) as (opened, status):
         scene = live_scene(opened, None)
@@ -284,6 +209,6 @@ def _ask_points(output: Path, request: Request) -> None:
     with progress_bar() as progress, open_finished_log(output, request, progress, say) as scene:
         say(
             f"measure {_LEAST_POINTS} to 4 of the points at which a marker was stationary; s skips a point, "
-            "q ends",
+            "q ends"
         )
         ask_places(scene)

@@ -2,79 +2,73 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+from rich.text import Text
 
-from ipsys_log.app.cli.console import console, print_json, progress_bar, say, warn
+from ipsys_log.app.cli import options as cli
+from ipsys_log.app.cli.console import print_result, progress_bar, say
 from ipsys_log.app.cli.lab_inputs import cameras_of, lab_of_run, load_calibrations
 from ipsys_log.app.cli.open_cameras import check_target, prepare_lab, record_now
 from ipsys_log.app.cli.options import (
-    AsJson,
-    Calibrations,
-    Corners,
-    LogList,
-    NoLogs,
-    OtherLog,
-    RigFile,
     figure_option,
     log_argument,
     log_option,
     other_log_option,
+    setting,
+    switch,
 )
 from ipsys_log.app.cli.stages import derive
+from ipsys_log.app.report.rows import wrap_text
+from ipsys_log.errors import IpsysError
+from ipsys_log.log.location import LogLocation
 from ipsys_log.plain_text import shell_words
 
 if TYPE_CHECKING:
     from ipsys_log.app.report.alignment import AlignedLab
     from ipsys_log.capture.lab import Lab
     from ipsys_log.live_runs.survey.drift_reading import DriftReading
-    from ipsys_log.log.location import LogLocation
 
 NoOrLogs = Annotated[
-    NoLogs, log_argument(help="Logs, files or URLs, read as one session. The last log gets the results.")
+    cli.NoLogs, log_argument(help="Logs, files or URLs, read as one session. The last log gets the results.")
 ]
 Output = Annotated[
-    Path | None,
-    log_option(help="A new log for the results. Without LOG, it also gets the camera frames."),
+    Path | None, log_option(help="A new log for the results. Without LOG, it also gets the camera frames.")
 ]
 Sources = Annotated[
-    LogList,
-    log_argument(help="Logs of one lab, files or URLs, in any order. Each is read on its own."),
+    cli.LogList, log_argument(help="Logs of one lab, files or URLs, in any order. Each is read on its own.")
 ]
 Baseline = Annotated[
-    OtherLog,
-    other_log_option("--baseline", help="The log before all moves. Default: the first by time."),
+    cli.OtherLog, other_log_option("--baseline", help="The log before all moves. Default: the first by time.")
 ]
 ModelLog = Annotated[
-    OtherLog,
+    cli.OtherLog,
     other_log_option(
-        "--model-from",
-        help="The log with the fitted model. Default: the baseline, if it has one.",
+        "--model-from", help="The log with the fitted model. Default: the baseline, if it has one."
     ),
 ]
 Fix = Annotated[
     bool,
-    typer.Option(
+    switch(
         "--fix",
-        help="Append the joint model with the new poses of the moved cameras to the last log, as a new run.",
+        "Append the joint model with the new poses of the moved cameras to the last log, as a new run.",
     ),
 ]
 
 
 def align(
     logs: NoOrLogs = None,
-    rig: RigFile = None,
-    calibration: Calibrations = None,
-    corners: Corners = None,
+    rig: cli.RigFile = None,
+    calibration: cli.Calibrations = None,
+    corners: cli.Corners = None,
     seconds: Annotated[
-        float, typer.Option(min=0.1, metavar="SECONDS", help="Without LOG: duration of the recording.")
+        float, setting("--seconds", "SECONDS", "Without LOG: duration of the recording.", min=0.1)
     ] = 3.0,
     plot: Annotated[Path | None, figure_option("the floor map and the camera images")] = None,
     output: Output = None,
-    as_json: AsJson = False,
+    as_json: cli.AsJson = False,
 ) -> None:
     """Show the tilt that makes each camera look straight down, and the floor that all cameras see.
 
@@ -88,10 +82,6 @@ def align(
         ipsys align --rig lab.toml                     # use the cameras now
         ipsys align monday.mcap --plot alignment.png   # of a log, with a figure
     """
-    from ipsys_log.app.report.files import check_figure_file
-
-    if plot is not None:
-        check_figure_file(plot, "--plot", logs or [])
     if logs:
         options: dict[str, Any] = {
             "rig": rig,
@@ -116,7 +106,6 @@ def _prepare_now(
     """Return the cameras to open, after all checks that are possible before they are opened."""
     from ipsys_log.capture.live_plan import check_start
     from ipsys_log.engine.request import Request
-    from ipsys_log.errors import IpsysError
 
     if rig is None:
         raise IpsysError("no log is given; name a log, or give --rig lab.toml to use its cameras now")
@@ -149,32 +138,30 @@ def _align(logs: Sequence[LogLocation], options: dict[str, Any], plot: Path | No
 
 
 def _show(lab: AlignedLab, plot: Path | None, as_json: bool) -> None:
-    from ipsys_log.app.report.alignment_text import alignment_json, alignment_table, coverage_lines
+    from ipsys_log.app.report.camera_poses import alignment_json, alignment_table, coverage_lines
 
+    parts = (alignment_table(lab), *_marked(coverage_lines(lab)))
+    print_result(alignment_json(lab), parts, as_json, lab.notes)
     if plot is not None:
-        from ipsys_log.app.report.alignment_figure import draw_alignment
+        from ipsys_log.app.report.camera_pose_figures import draw_alignment
 
         draw_alignment(lab, plot)
-    if as_json:
-        print_json(alignment_json(lab))
-    else:
-        console.print(alignment_table(lab))
-        for line, good in coverage_lines(lab):
-            console.print(line, style="green" if good else "red", soft_wrap=False)
-    for note in lab.notes:
-        warn(note)
-    if plot is not None:
         say(f"{plot} drawn")
+
+
+def _marked(lines: Iterable[tuple[str, bool]]) -> Iterator[Text]:
+    """Yield lines of at most 80 columns, in green if they are good, else in red."""
+    return (Text(wrap_text(line), "green" if is_good else "red") for line, is_good in lines)
 
 
 def drift(
     logs: Sources,
     baseline: Baseline = None,
     model_from: ModelLog = None,
-    rig: RigFile = None,
+    rig: cli.RigFile = None,
     fix: Fix = False,
     plot: Annotated[Path | None, figure_option("the drift over time")] = None,
-    as_json: AsJson = False,
+    as_json: cli.AsJson = False,
 ) -> None:
     """Show which camera moved, when, and by how much its positions are wrong since then.
 
@@ -187,12 +174,9 @@ def drift(
         ipsys drift week*.mcap --model-from calibration.mcap --rig lab.toml
         ipsys drift week*.mcap --fix                       # correct its pose
     """
-    from ipsys_log.app.report.files import check_figure_file
     from ipsys_log.live_runs.survey.drift_reading import read_drift
     from ipsys_log.messages.rig_file import load_rig
 
-    if plot is not None:
-        check_figure_file(plot, "--plot", logs)
     lab = load_rig(rig) if rig is not None else None
     with progress_bar(()) as progress:
         reading = read_drift(
@@ -201,7 +185,7 @@ def drift(
     run = _fix(reading) if fix else None
     _print(reading, run, as_json)
     if plot is not None:
-        from ipsys_log.app.report.drift_figure import draw_drift
+        from ipsys_log.app.report.camera_pose_figures import draw_drift
 
         draw_drift(reading, plot)
         say(f"{plot} drawn")
@@ -211,7 +195,6 @@ def _fix(reading: DriftReading) -> str | None:
     """Append the mended model to the last log; return its run, or None if no camera has moved."""
     from ipsys_log.calibration.joint.payload import PoseChange
     from ipsys_log.engine.mended_model import append_mended_model
-    from ipsys_log.errors import IpsysError
 
     moved = reading.moved()
     if not moved:
@@ -233,15 +216,8 @@ def _fix(reading: DriftReading) -> str | None:
 
 
 def _print(reading: DriftReading, run: str | None, as_json: bool) -> None:
-    from ipsys_log.app.report.drift import drift_json, drift_lines, drift_table
+    from ipsys_log.app.report.camera_poses import drift_json, drift_lines, drift_table
 
-    if as_json:
-        result = {**drift_json(reading), **({} if run is None else {"mended_run": run})}
-        print_json(result)
-    else:
-        for line, is_good in drift_lines(reading):
-            console.print(line, style="green" if is_good else "red")
-        console.print()
-        console.print(drift_table(reading))
-    for remark in reading.remarks:
-        warn(remark)
+    result = {**drift_json(reading), **({} if run is None else {"mended_run": run})}
+    parts = (*_marked(drift_lines(reading)), "", drift_table(reading))
+    print_result(result, parts, as_json, reading.remarks)

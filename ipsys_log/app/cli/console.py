@@ -15,6 +15,7 @@ from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
 from rich.text import Text
 
+from ipsys_log.app.report.rows import counted
 from ipsys_log.plain_text import plain_text
 
 if TYPE_CHECKING:
@@ -96,14 +97,7 @@ def progress_bar(
     frame_steps : names of the steps that count frames: their bars show a rate. Default: the causal stages.
     lines_in_pipe : print lines in a file or a pipe, as :func:`progress_lines`; otherwise nothing.
     """
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TaskID,
-        TextColumn,
-        TimeRemainingColumn,
-    )
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
     columns = (
         TextColumn("{task.description:<13}"),
@@ -115,7 +109,10 @@ def progress_bar(
     if not remarks.is_terminal:
         yield progress_lines() if lines_in_pipe else lambda stage, done, total: None
         return
-    rated = _causal_stages() if frame_steps is None else frame_steps
+    if frame_steps is None:
+        from ipsys_log.engine.graph import STAGES
+
+        frame_steps = {stage.name for stage in STAGES if stage.causal}
     with Progress(*columns, console=remarks, transient=True) as bar:
         bars: dict[str, TaskID] = {}
         steps: dict[str, str] = {}
@@ -135,7 +132,7 @@ def progress_bar(
                 return
             drawn_s = now_s
             speed = bar.tasks[bars[stage]].speed
-            rate = f"{speed:,.0f} frames/s" if speed and stage in rated else ""
+            rate = f"{speed:,.0f} frames/s" if speed and stage in frame_steps else ""
             bar.update(bars[stage], completed=done, rate=rate)
 
         yield show
@@ -154,12 +151,6 @@ def progress_lines() -> Progress:
             say(f"{stage}: {done} of {total}")
 
     return show
-
-
-def _causal_stages() -> set[str]:
-    from ipsys_log.engine.graph import STAGES
-
-    return {stage.name for stage in STAGES if stage.causal}
 
 
 def say(text: str) -> None:
@@ -184,13 +175,23 @@ def print_json(value: Any) -> None:
     print(json.dumps(result, indent=2, allow_nan=False))  # noqa: T201
 
 
+def print_result(value: Any, parts: Iterable[object], as_json: bool, notes: Iterable[str] = ()) -> None:
+    """Print a result for programs, or its tables and lines; then remarks on it."""
+    if as_json:
+        print_json(value)
+    else:
+        for part in parts:
+            console.print(part)
+    for note in notes:
+        warn(note)
+
+
 def print_outcomes(outcomes: Sequence[Outcome]) -> None:
     """Print the stages that were computed, were up to date, or were left out."""
     rest = _print_many(outcomes)
     width = max((len(outcome.run) for outcome in rest), default=0)
     for outcome in rest:
-        count = "1 message" if outcome.messages == 1 else f"{outcome.messages} messages"
-        state = count if outcome.fresh else "up to date"
+        state = counted(outcome.messages, "message") if outcome.fresh else "up to date"
         remarks.print(f"{outcome.stage:<13} run {outcome.run:<{width}} {state}")
         for remark in outcome.remarks:
             remarks.print(f"  {remark}", style="yellow")

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
+from rich.text import Text
 
-from ipsys_log.app.cli.console import console, print_json, progress_bar, say
-from ipsys_log.app.cli.options import AsJson, file_log_argument
+from ipsys_log.app.cli.console import console, print_result, progress_bar, say
+from ipsys_log.app.cli.options import AsJson, file_log_argument, setting, switch
 from ipsys_log.app.cli.signals import say_kept
-from ipsys_log.plain_text import shell_words
-
-if TYPE_CHECKING:
-    from ipsys_log.log.location import LogLocation
+from ipsys_log.app.report.files import check_file, check_parquet_name
+from ipsys_log.errors import IpsysError
+from ipsys_log.extras import check_installed
+from ipsys_log.log.location import LogLocation, parse_location
+from ipsys_log.plain_text import plain_text, shell_words
 
 _MOST_LINES = 30
 
@@ -28,30 +30,25 @@ def catalogue(
             "such as s3://lab/2026-*/*.mcap.",
         ),
     ],
-    output: Annotated[
-        Path,
-        typer.Option("--output", "-o", metavar="FILE", help="The catalogue: a Parquet file (.parquet)."),
-    ],
+    output: Annotated[Path, setting("--output,-o", "FILE", "The catalogue: a Parquet file (.parquet).")],
     baseline: Annotated[
         str | None,
-        typer.Option(
+        setting(
             "--baseline",
-            metavar="LOG",
-            help="Also record the drift of the cameras since this log, by their reference markers.",
+            "LOG",
+            "Also record the drift of the cameras since this log, by their reference markers.",
         ),
     ] = None,
     model_from: Annotated[
         str | None,
-        typer.Option(
-            "--model-from", metavar="LOG", help="The log with the model for the drift. Default: the baseline."
-        ),
+        setting("--model-from", "LOG", "The log with the model for the drift. Default: the baseline."),
     ] = None,
     derived: Annotated[
         Path | None,
-        typer.Option(
+        setting(
             "--derived",
-            metavar="FOLDER",
-            help="The folder of -o in ipsys batch replay, with the results of logs that cannot be appended "
+            "FOLDER",
+            "The folder of -o in ipsys batch replay, with the results of logs that cannot be appended "
             "to. They count with their log. Default: the working folder.",
         ),
     ] = None,
@@ -68,11 +65,6 @@ def catalogue(
         ipsys catalogue logs -o catalogue.parquet --baseline logs/first.mcap
     """
     from ipsys_log.api.catalogue import Baseline, update_catalogue
-    from ipsys_log.app.report.files import check_file, check_parquet_name
-    from ipsys_log.errors import IpsysError
-    from ipsys_log.extras import check_installed
-    from ipsys_log.log.location import parse_location
-    from ipsys_log.plain_text import plain_text
 
     check_installed("catalogue needs", "pyarrow")
     check_parquet_name(output, "-o")
@@ -90,22 +82,16 @@ def catalogue(
         update = update_catalogue(
             place, output, since, derived, lambda done, total: progress("logs", done, total)
         )
-    if as_json:
-        print_json(asdict(update))
-        return
     removed = f", {update.removed} removed" if update.removed else ""
-    console.print(f"{output} written: {update.logs} logs, {update.read} read{removed}")
+    lines: list[str | Text] = [f"{output} written: {update.logs} logs, {update.read} read{removed}"]
     errors = [f"{log}: {text}" for log, text in update.errors.items()]
-    for line in errors[:_MOST_LINES]:
-        console.print(plain_text(line), style="yellow")
+    lines += [Text(plain_text(line), "yellow") for line in errors[:_MOST_LINES]]
     if len(errors) > _MOST_LINES:
-        console.print(f"and {len(errors) - _MOST_LINES} more logs with errors: --json lists all")
+        lines.append(f"and {len(errors) - _MOST_LINES} more logs with errors: --json lists all")
+    print_result(asdict(update), lines, as_json)
 
 
 def _log(name: str, text: str) -> LogLocation:
-    from ipsys_log.errors import IpsysError
-    from ipsys_log.log.location import parse_location
-
     log = parse_location(text)
     if isinstance(log, Path) and not log.is_file():
         raise IpsysError(f"{name} {log}: is not a file; name a log")
@@ -114,44 +100,33 @@ def _log(name: str, text: str) -> LogLocation:
 
 def pack(
     logs: Annotated[
-        list[Path] | None,
-        file_log_argument(help="Logs, read as one session; they stay unchanged."),
+        list[Path] | None, file_log_argument(help="Logs, read as one session; they stay unchanged.")
     ] = None,
     output: Annotated[
         Path | None,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="DATASET",
-            help="The dataset to write: a folder, or a zip archive if the name ends in .zip.",
+        setting(
+            "--output,-o",
+            "DATASET",
+            "The dataset to write: a folder, or a zip archive if the name ends in .zip.",
         ),
     ] = None,
-    card: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="The filled form of the dataset card."),
-    ] = None,
+    card: Annotated[Path | None, setting("--card", "FILE", "The filled form of the dataset card.")] = None,
     card_form: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Only write the empty form of the dataset card."),
+        Path | None, setting("--card-form", "FILE", "Only write the empty form of the dataset card.")
     ] = None,
     model: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="NAME",
-            help="Score this model; repeat it for several. Default: all that the logs allow.",
+        setting(
+            "--model", "NAME", "Score this model; repeat it for several. Default: all that the logs allow."
         ),
     ] = None,
     without_images: Annotated[
-        bool,
-        typer.Option("--without-images", help="Leave out the images, and keep the detected markers."),
+        bool, switch("--without-images", "Leave out the images, and keep the detected markers.")
     ] = False,
     blur: Annotated[
-        bool,
-        typer.Option(
-            "--blur", help="Blur the images outside of the detected markers: a new recording, in grey."
-        ),
+        bool, switch("--blur", "Blur the images outside of the detected markers: a new recording, in grey.")
     ] = False,
-    every: Annotated[int, typer.Option(min=1, metavar="N", help="Keep each n-th frame of each camera.")] = 1,
+    every: Annotated[int, setting("--every", "N", "Keep each n-th frame of each camera.", min=1)] = 1,
 ) -> None:
     """Write logs as a dataset: the recorded channels, the rig, a card, checksums and the expected scores.
 
@@ -164,7 +139,6 @@ def pack(
         ipsys pack calibration.mcap -o small.zip --card card.toml --without-images
     """
     from ipsys_log.app.report.pack_scores import pack_text
-    from ipsys_log.errors import IpsysError
     from ipsys_log.tools.publish.card import write_card_form
     from ipsys_log.tools.publish.packing import pack as pack_logs
 
@@ -203,9 +177,10 @@ def score(
     ],
     model: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="MODEL",
-            help="Repeat only this model, or score your own as FILE.py:CLASS; repeat it for several.",
+        setting(
+            "--model",
+            "MODEL",
+            "Repeat only this model, or score your own as FILE.py:CLASS; repeat it for several.",
         ),
     ] = None,
     as_json: AsJson = False,
@@ -225,12 +200,7 @@ def score(
 
     with say_kept(lambda _: f"{dataset} is unchanged"), progress_bar(lines_in_pipe=True) as progress:
         result = api.score(dataset, models=model or (), progress=progress, say=say)
-    if as_json:
-        print_json(score_json(result))
-    else:
-        console.print(score_answer(result))
-        for table in score_tables(result):
-            console.print()
-            console.print(table)
+    tables = [part for table in score_tables(result) for part in ("", table)]
+    print_result(score_json(result), (score_answer(result), *tables), as_json)
     if result.as_stated is False:
         raise typer.Exit(1)

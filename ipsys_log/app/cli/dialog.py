@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 import typer
 
 from ipsys_log.app.cli.console import console
+from ipsys_log.errors import IpsysError
+from ipsys_log.units import CM_PER_M
 
 if TYPE_CHECKING:
     from ipsys_log.live_runs.survey.checks import EntryCheck
@@ -167,7 +169,6 @@ def ask_places(scene: MeasuringScene) -> None:
 
 def _ask_baseline(scene: MeasuringScene) -> None:
     """Ask once for the distance AB with this tape, where it counts; Enter or a letter skips it."""
-    from ipsys_log.errors import IpsysError
     from ipsys_log.live_runs.survey.checks import baseline_names, needs_baseline, read_baseline
 
     while needs_baseline(scene.rig, scene.history()):
@@ -212,8 +213,6 @@ def _measure(
     scene: MeasuringScene, interval: int | None, before: TypedEntry | None, saved: list[str]
 ) -> TypedEntry | None:
     """Ask for one point and append it; return the typed texts if the point must be asked for again."""
-    from ipsys_log.errors import IpsysError
-
     typed = _ask_point(scene, interval, before)
     while True:
         checked = _check(scene, interval, typed)
@@ -269,8 +268,6 @@ def _ask_point(scene: MeasuringScene, interval: int | None, before: TypedEntry |
 
 
 def _show(checked: EntryCheck) -> None:
-    from ipsys_log.units import CM_PER_M
-
     for fault in checked.faults:
         console.print(fault.text, style="red")
     if checked.point_m is not None:
@@ -293,7 +290,6 @@ def _undo(scene: MeasuringScene, saved: list[str]) -> Measurement | None:
 
     A measurement of an earlier session is withdrawn only if the user agrees.
     """
-    from ipsys_log.errors import IpsysError
     from ipsys_log.live_runs.survey.checks import withdrawal_of
     from ipsys_log.statistics.calibration_points import active_measurements
 
@@ -317,8 +313,6 @@ def _undo(scene: MeasuringScene, saved: list[str]) -> Measurement | None:
 
 def _agreed_to_withdraw(measurement: Measurement) -> bool:
     """Ask before a measurement of an earlier session is withdrawn; a letter means no."""
-    from ipsys_log.units import CM_PER_M
-
     tapes = ", ".join(f"{tape.reference} {tape.distance_m * CM_PER_M:.1f}" for tape in measurement.distances)
     text = f"{measurement.id} (marker {measurement.marker_id}{': ' if tapes else ''}{tapes})"
     try:

@@ -9,20 +9,12 @@ from typing import Annotated, Any
 
 import typer
 
-from ipsys_log.app.cli.console import console, print_json, progress_bar, say, warn
+from ipsys_log.app.cli import options as cli
+from ipsys_log.app.cli.console import console, print_result, progress_bar, say, warn
 from ipsys_log.app.cli.lab_inputs import load_calibrations, read_lab, say_remark, say_unusual
-from ipsys_log.app.cli.options import (
-    REQUIRED,
-    AsJson,
-    Calibrations,
-    Option,
-    RigFile,
-    appended_log_option,
-    log_option,
-    option,
-    read_files,
-    with_options,
-)
+from ipsys_log.app.cli.options import appended_log_option, log_option, option, read_files, with_options
+from ipsys_log.errors import IpsysError
+from ipsys_log.extras import check_installed
 from ipsys_log.plain_text import shell_words
 
 _MCAP_MAGIC = b"\x89MCAP"
@@ -43,10 +35,10 @@ _INTO = appended_log_option(
     help="For truth: the log of the same drive. For detections: a log without images. It gets a run."
 )
 # The options of all kinds.
-_OPTIONS: dict[str, Option] = {
+_OPTIONS: dict[str, cli.Option] = {
     "into": (Annotated[Path | None, _INTO], None),
-    "rig": (RigFile, None),
-    "calibration": (Calibrations, None),
+    "rig": (cli.RigFile, None),
+    "calibration": (cli.Calibrations, None),
     "rate": option(float | None, "--rate", "HZ", "Images per second, if they have no times. Default: 1."),
     "times": option(
         str | None, "--times", "FILE|names",
@@ -84,13 +76,13 @@ _OPTIONS: dict[str, Option] = {
     "length_unit": option(
         str | None, "--length-unit", "m|mm", "Unit of x, y and z whose header has none."
     ),
-    "as_json": (AsJson, False),
+    "as_json": (cli.AsJson, False),
 }  # fmt: skip
 
 
 @with_options(
     {
-        "sources": (_SOURCES, REQUIRED),
+        "sources": (_SOURCES, cli.REQUIRED),
         "output": (Annotated[Path | None, _NEW_LOG], None),
         "kind": option(
             str | None,
@@ -125,8 +117,6 @@ def import_(sources: list[Path], output: Path | None, kind: str | None, **option
         ipsys import lab.bag -o lab.mcap                    # a ROS bag
         ipsys import vicon.csv --into monday.mcap           # ground truth
     """
-    from ipsys_log.errors import IpsysError
-
     for source in sources:
         _refuse_log(Path(str(source).rpartition("=")[2]))
     kind = kind or _find_kind(sources[0])
@@ -137,8 +127,6 @@ def import_(sources: list[Path], output: Path | None, kind: str | None, **option
 
 def _import_as(kind: str, sources: list[Path], output: Path | None, options: dict[str, Any]) -> None:
     """Call the importer of a kind with its options; refuse options that other kinds have."""
-    from ipsys_log.errors import IpsysError
-
     importer = KINDS[kind]
     read = {*inspect.signature(importer).parameters}
     for name, value in options.items():
@@ -155,8 +143,6 @@ def _import_as(kind: str, sources: list[Path], output: Path | None, options: dic
 
 def _find_kind(source: Path) -> str:
     """Return the kind of a source by its name, its files, or the header of its table."""
-    from ipsys_log.errors import IpsysError
-
     suffix = source.suffix.lower()
     if not source.exists():
         if "=" in str(source):
@@ -230,7 +216,6 @@ def _import_ros(
     source: Path, output: Path, camera: list[str] | None, rig: Path | None, calibration: list[str] | None
 ) -> None:
     from ipsys_log.engine.output import write_log
-    from ipsys_log.extras import check_installed
 
     check_installed("import of ROS bags needs", "rosbags")
     from ipsys_log.exchange.calibration_files import announce_assumed
@@ -272,11 +257,7 @@ def _import_truth(
         load_rig(rig) if rig else None,
     )
     imported = import_truth(sources, into, output, options)
-    if as_json:
-        print_json(truth_json(imported))
-    else:
-        for line in truth_lines(imported):
-            console.print(line)
+    print_result(truth_json(imported), truth_lines(imported), as_json)
     say(f"results are in {imported.path}")
 
 
@@ -308,7 +289,6 @@ def _import_detections(
 
 def _import_pairs(source: Path, output: Path, rig: Path | None) -> None:
     from ipsys_log.engine.output import write_log
-    from ipsys_log.errors import IpsysError
     from ipsys_log.exchange.import_tables import pair_messages, read_pairs
     from ipsys_log.messages.rig_file import load_rig
 
@@ -334,8 +314,6 @@ KINDS: dict[str, Callable[..., None]] = {
 
 def _refuse_log(path: Path) -> None:
     """Refuse a file that is a log already, by its first bytes."""
-    from ipsys_log.errors import IpsysError
-
     try:
         with path.open("rb") as file:
             is_log = file.read(len(_MCAP_MAGIC)) == _MCAP_MAGIC
@@ -358,7 +336,6 @@ def _by_camera(files: list[str]) -> dict[str, Path]:
 
 def _split_names(words: list[str], kind: str, example: str) -> dict[str, str]:
     """Return the texts after the equals signs of words such as ``red=red.mp4``, by camera."""
-    from ipsys_log.errors import IpsysError
     from ipsys_log.messages.rig_file import check_name
 
     named: dict[str, str] = {}

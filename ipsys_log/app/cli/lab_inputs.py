@@ -7,39 +7,38 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
 from ipsys_log.app.cli.console import say, warn
+from ipsys_log.app.cli.options import setting
+from ipsys_log.app.report.files import check_folder, write_files
+from ipsys_log.errors import IpsysError
+from ipsys_log.log.location import LogLocation, LogUrl, parse_location
 
 if TYPE_CHECKING:
     from ipsys_log.capture.lab import Lab
     from ipsys_log.log.dataset import Session
-    from ipsys_log.log.location import LogLocation
     from ipsys_log.messages import CameraCalibration, Rig
 
 Focal = Annotated[
     list[str] | None,
-    typer.Option(
+    setting(
         "--focal",
-        metavar="[CAMERA=]PX",
-        help="Nominal focal length in pixels, of one camera, or of all cameras without a calibration. The "
+        "[CAMERA=]PX",
+        "Nominal focal length in pixels, of one camera, or of all cameras without a calibration. The "
         "fit estimates the intrinsics.",
     ),
 ]
 FieldOfView = Annotated[
     list[str] | None,
-    typer.Option(
-        "--field-of-view",
-        metavar="[CAMERA=]DEGREES",
-        help="Nominal horizontal field of view, instead of a focal length.",
+    setting(
+        "--field-of-view", "[CAMERA=]DEGREES", "Nominal horizontal field of view, instead of a focal length."
     ),
 ]
 SaveNominal = Annotated[
     Path | None,
-    typer.Option(
+    setting(
         "--save-nominal",
-        metavar="DIR",
-        help="With LOG: write the nominal intrinsics into this folder, such as red.yaml, for lab.toml and "
+        "DIR",
+        "With LOG: write the nominal intrinsics into this folder, such as red.yaml, for lab.toml and "
         "--calibration of later commands.",
     ),
 ]
@@ -62,7 +61,6 @@ def load_calibrations(
     """
     if not options:
         return {}
-    from ipsys_log.errors import IpsysError
     from ipsys_log.exchange.calibration_files import read_intrinsics
     from ipsys_log.log.dataset import Session
 
@@ -114,8 +112,6 @@ def split_calibration(option: str) -> tuple[str | None, LogLocation]:
 
     The query of a URL may have an equals sign, too.
     """
-    from ipsys_log.log.location import LogUrl, parse_location
-
     camera, equals, name = option.partition("=")
     if not equals or isinstance(parse_location(option), LogUrl):
         return None, parse_location(option)
@@ -126,11 +122,6 @@ def load_matching_rig(path: Path | None, cameras: Callable[[], Collection[str]])
     """Read a rig for cameras that are given by their images; None if no file is named.
 
     A rig that describes only some of the cameras causes a remark.
-
-    Raises
-    ------
-    IpsysError
-        The rig cannot be read, or describes only other cameras.
     """
     if path is None:
         return None
@@ -189,11 +180,6 @@ def load_lab(
 
     The intrinsics come from ``calibration``, else from the file that the rig names, relative to the rig file.
     The files of the rig are read only ``with_lenses``.
-
-    Raises
-    ------
-    IpsysError
-        The rig has no such camera, or no camera with a source.
     """
     from ipsys_log.capture.lab import Lab
     from ipsys_log.exchange.lab_files import load_cameras, load_lenses
@@ -221,21 +207,17 @@ def cameras_of(logs: Sequence[LogLocation]) -> set[str]:
 
 
 def nominal_lenses_of_logs(
-    logs: Sequence[LogLocation],
-    given: dict[str, CameraCalibration],
-    focal: list[str],
-    field_of_view: list[str],
+    logs: Sequence[LogLocation], given: dict[str, CameraCalibration], options: Sequence[tuple[str, str]]
 ) -> dict[str, CameraCalibration]:
-    """Return nominal intrinsics of the cameras of logs, by camera."""
+    """Return nominal intrinsics of the cameras of logs, by camera; see :func:`nominal_lenses`."""
     from ipsys_log.engine.checks import image_sizes
     from ipsys_log.log.dataset import Session
 
-    if not focal and not field_of_view:
+    if not options:
         return {}
     with Session(logs) as session:
         sizes_px = image_sizes(session)
         calibrated = {*session.calibrations, *given}
-    options = [*(("--focal", text) for text in focal), *(("--field-of-view", text) for text in field_of_view)]
     return nominal_lenses(options, sorted(cameras_of(logs)), calibrated, sizes_px)
 
 
@@ -260,7 +242,6 @@ def nominal_lenses(
         A text is not a number, or names no camera; or the size of an image is unknown.
     """
     from ipsys_log.calibration.lens_models import nominal_intrinsics
-    from ipsys_log.errors import IpsysError
 
     lenses: dict[str, CameraCalibration] = {}
     for option, text in options:
@@ -288,8 +269,6 @@ def nominal_lenses(
 
 
 def _positive(option: str, text: str, number: str) -> float:
-    from ipsys_log.errors import IpsysError
-
     try:
         value = float(number)
     except ValueError:
@@ -306,9 +285,7 @@ def write_nominal(lenses: Mapping[str, CameraCalibration], folder: Path) -> None
     The estimated intrinsics of the fit are not for other uses: above a level floor, focal length and height
     of a camera are nearly the same unknown.
     """
-    from ipsys_log.app.report.files import check_folder, write_files
     from ipsys_log.calibration.joint.observations import lens_model_of
-    from ipsys_log.errors import IpsysError
     from ipsys_log.exchange.calibration_files import opencv_yaml
 
     check_folder(folder, "--save-nominal")

@@ -2,31 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
-from ipsys_log.app.cli.console import console, print_json, progress_bar, say
-from ipsys_log.app.cli.options import (
-    REQUIRED,
-    AsJson,
-    LogList,
-    NewLog,
-    Option,
-    Overwrite,
-    ReadLogs,
-    flag,
-    log_argument,
-    log_option,
-    option,
-    with_options,
-)
+from ipsys_log.app.cli import options as cli
+from ipsys_log.app.cli.console import console, print_result, progress_bar, say
+from ipsys_log.app.cli.options import flag, log_argument, log_option, option, setting, with_options
+from ipsys_log.app.report.rows import counted
+from ipsys_log.errors import IpsysError
+from ipsys_log.log.location import LogLocation
 from ipsys_log.plain_text import shell_words
+from ipsys_log.units import format_bytes
 
 if TYPE_CHECKING:
-    from ipsys_log.log.location import LogLocation
     from ipsys_log.tools.cut import DroppedRun
     from ipsys_log.tools.merge import MergeResult
     from ipsys_log.tools.merge_plan import LogOffset
@@ -36,7 +25,7 @@ _TIME = "UTC, such as '2026-05-04 10:00:00', or seconds from the start of the lo
 
 
 # The options that select a part, as the fields of `CutOptions`.
-_SELECTION: dict[str, Option] = {
+_SELECTION: dict[str, cli.Option] = {
     "start": option(str, "--start", "TIME", f"Keep messages from this time on: {_TIME}", ""),
     "end": option(str, "--end", "TIME", f"Keep messages before this time: {_TIME}", ""),
     "topics": option(
@@ -67,15 +56,15 @@ _SELECTION: dict[str, Option] = {
 
 @with_options(
     {
-        "logs": (ReadLogs, REQUIRED),
+        "logs": (cli.ReadLogs, cli.REQUIRED),
         "output": (Annotated[Path | None, log_option(help=_NEW_LOG)], None),
         **_SELECTION,
         "compact": flag(
             "--compact", "Leave out superseded and unfinished runs, and keep everything else of one LOG."
         ),
         "dry_run": flag("--dry-run", "With --compact: only list these runs, and write nothing."),
-        "overwrite": (Overwrite, False),
-        "as_json": (AsJson, False),
+        "overwrite": (cli.Overwrite, False),
+        "as_json": (cli.AsJson, False),
     }
 )
 def cut(
@@ -104,10 +93,8 @@ def cut(
         ipsys cut monday.mcap -o poly.mcap --run poly
         ipsys cut calibration.mcap --compact --dry-run     # which runs, how much?
     """
-    from ipsys_log.errors import IpsysError
     from ipsys_log.tools.cut import cut as cut_logs
     from ipsys_log.tools.cut_selection import CutOptions
-    from ipsys_log.units import format_bytes
 
     chosen: dict[str, Any] = {name: value for name, value in selection.items() if value is not None}
     options = CutOptions(**chosen)
@@ -123,13 +110,9 @@ def cut(
     with progress_bar() as progress:
         result = cut_logs(logs, output, options, overwrite, progress)
     size = output.stat().st_size
-    if as_json:
-        print_json({"output": str(output), **result._asdict(), "bytes": size})
-        return
-    console.print(
-        f"{output} written: {result.kept} of {result.messages} messages, {result.channels} channels, "
-        f"{format_bytes(size)}"
-    )
+    text = f"{result.kept} of {result.messages} messages, {result.channels} channels, {format_bytes(size)}"
+    value = {"output": str(output), **result._asdict(), "bytes": size}
+    print_result(value, [f"{output} written: {text}"], as_json)
 
 
 def _compact(
@@ -137,7 +120,6 @@ def _compact(
 ) -> None:
     """Copy a log without its superseded and unfinished runs, or list them."""
     from ipsys_log.engine.output import check_copy
-    from ipsys_log.errors import IpsysError
     from ipsys_log.log.log_files import read_log_state
     from ipsys_log.tools.cut import compact, dropped_runs
 
@@ -150,32 +132,40 @@ def _compact(
         check_copy([log], output, overwrite)
     dropped, size = dropped_runs(log), read_log_state(log).size
     written = output if dropped and not dry_run else None
-    if not as_json:
-        _show_dropped(log, size, dropped)
+    for line in () if as_json else _dropped_lines(log, size, dropped):
+        console.print(line)
+    after, saved = None, []
     if written is not None:
         with progress_bar() as progress:
             compact(log, written, overwrite, progress)
-    if as_json:
-        print_json(_compact_json(log, size, written, dropped))
-    elif written is not None:
-        _show_saving(size, written)
+        after = written.stat().st_size
+        saved = [f"{written} written: {format_bytes(after)} instead of {format_bytes(size)}"]
+    value = {
+        "log": str(log),
+        "output": None if written is None else str(written),
+        "bytes": size,
+        "output_bytes": after,
+        "dropped": [_dropped_json(one) for one in dropped],
+    }
+    print_result(value, saved, as_json)
 
 
 def merge(
     logs: Annotated[
-        LogList,
+        cli.LogList,
         log_argument(help="The logs of the recorders, files or URLs. The clock of the first log counts."),
     ],
-    output: NewLog,
+    output: cli.NewLog,
     offset: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="NAME=SECONDS",
-            help="Add these seconds to all times of a log, such as monday_b=0.012; repeat it for several.",
+        setting(
+            "--offset",
+            "NAME=SECONDS",
+            "Add these seconds to all times of a log, such as monday_b=0.012; repeat it for several.",
         ),
     ] = None,
-    overwrite: Overwrite = False,
-    as_json: AsJson = False,
+    overwrite: cli.Overwrite = False,
+    as_json: cli.AsJson = False,
 ) -> None:
     """Merge the logs of several recorders of one session, with different cameras, into a new log.
 
@@ -198,65 +188,38 @@ def merge(
     with progress_bar() as progress:
         offsets = choose_offsets(logs, offset or (), progress)
         result = merge_logs(logs, output, offsets, overwrite, progress)
-    if as_json:
-        print_json(_merge_json(output, result))
-        return
-    _show_offsets(logs, offsets)
-    from ipsys_log.units import format_bytes
-
-    console.print(f"{output} written: {result.messages} messages, {format_bytes(output.stat().st_size)}")
-    say(f"next: ipsys replay {shell_words(output)}")
+    lines = _offset_lines(logs, offsets)
+    written = f"{output} written: {result.messages} messages, {format_bytes(output.stat().st_size)}"
+    print_result(_merge_json(output, result), [*lines, written], as_json)
+    if not as_json:
+        say(f"next: ipsys replay {shell_words(output)}")
 
 
-def _show_dropped(log: LogLocation, size: int, dropped: list[DroppedRun]) -> None:
-    from ipsys_log.units import format_bytes
-
+def _dropped_lines(log: LogLocation, size: int, dropped: list[DroppedRun]) -> Iterator[str]:
     if not dropped:
-        console.print(f"{log}: no run is superseded or unfinished; nothing is written")
+        yield f"{log}: no run is superseded or unfinished; nothing is written"
         return
     for one in dropped:
-        count = "1 message" if one.messages == 1 else f"{one.messages} messages"
-        stored = format_bytes(one.stored_bytes)
-        console.print(f"{one.run.run} is dropped: {one.run.reason}; {count}, about {stored}")
+        count, stored = counted(one.messages, "message"), format_bytes(one.stored_bytes)
+        yield f"{one.run.run} is dropped: {one.run.reason}; {count}, about {stored}"
     gained = sum(one.stored_bytes for one in dropped)
-    console.print(
-        f"{len(dropped)} run{'' if len(dropped) == 1 else 's'}, about {format_bytes(gained)} of "
-        f"{format_bytes(size)}",
-    )
+    yield f"{counted(len(dropped), 'run')}, about {format_bytes(gained)} of {format_bytes(size)}"
 
 
-def _show_saving(before: int, output: Path) -> None:
-    from ipsys_log.units import format_bytes
-
-    after = output.stat().st_size
-    console.print(f"{output} written: {format_bytes(after)} instead of {format_bytes(before)}")
-
-
-def _compact_json(
-    log: LogLocation, size: int, output: Path | None, dropped: list[DroppedRun]
-) -> dict[str, Any]:
+def _dropped_json(one: DroppedRun) -> dict[str, Any]:
     return {
-        "log": str(log),
-        "output": None if output is None else str(output),
-        "bytes": size,
-        "output_bytes": None if output is None else output.stat().st_size,
-        "dropped": [
-            {
-                "run": one.run.run,
-                "reason": one.run.reason,
-                "stages": one.run.stages,
-                "messages": one.messages,
-                "stored_bytes": one.stored_bytes,
-            }
-            for one in dropped
-        ],
+        "run": one.run.run,
+        "reason": one.run.reason,
+        "stages": one.run.stages,
+        "messages": one.messages,
+        "stored_bytes": one.stored_bytes,
     }
 
 
-def _show_offsets(logs: Sequence[LogLocation], offsets: Sequence[LogOffset]) -> None:
+def _offset_lines(logs: Sequence[LogLocation], offsets: Sequence[LogOffset]) -> Iterator[str]:
     for path, offset in zip(logs[1:], offsets[1:], strict=True):
         sigma = "" if offset.sigma_s is None else f" (estimated, sigma {offset.sigma_s * 1e3:.2f} ms)"
-        console.print(f"{path}: {offset.offset_ns / 1e9:+.6f} s are added to its times{sigma}")
+        yield f"{path}: {offset.offset_ns / 1e9:+.6f} s are added to its times{sigma}"
 
 
 def _merge_json(output: Path, result: MergeResult) -> dict[str, Any]:
@@ -264,11 +227,7 @@ def _merge_json(output: Path, result: MergeResult) -> dict[str, Any]:
         "output": str(output),
         "messages": result.messages,
         "logs": [
-            {
-                "name": one.name,
-                "offset_ns": one.offset_ns,
-                "offset_sigma_s": one.offset_sigma_s,
-            }
-            for one in result.logs
+            {"name": log.name, "offset_ns": log.offset_ns, "offset_sigma_s": log.offset_sigma_s}
+            for log in result.logs
         ],
     }

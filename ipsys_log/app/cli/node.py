@@ -9,9 +9,12 @@ import typer
 
 from ipsys_log.app.cli.console import say, warn
 from ipsys_log.app.cli.open_cameras import check_target, open_cameras, prepare_lab
-from ipsys_log.app.cli.options import Calibrations, Corners, Force, log_option
+from ipsys_log.app.cli.options import Calibrations, Corners, Force, log_option, setting, switch
 from ipsys_log.app.cli.signals import allow_interrupt, runs_until_stopped
+from ipsys_log.errors import IpsysError
+from ipsys_log.extras import check_installed
 from ipsys_log.plain_text import shell_words
+from ipsys_log.units import format_time
 
 if TYPE_CHECKING:
     from ipsys_log.capture.lab import Lab
@@ -30,29 +33,23 @@ def node(
         Path, typer.Argument(metavar="FILE", help="The rig file, with the source of the camera.")
     ] = Path("lab.toml"),
     camera: Annotated[
-        str, typer.Option("--camera", metavar="NAME", help="The camera of this host; the node has its name.")
+        str, setting("--camera", "NAME", "The camera of this host; the node has its name.")
     ] = "",
     output: NodeLog = None,
     centre: Annotated[
-        str | None,
-        typer.Option(
-            "--centre", metavar="HOST:PORT", help="The address of the centre, instead of the rig's."
-        ),
+        str | None, setting("--centre", "HOST:PORT", "The address of the centre, instead of the rig's.")
     ] = None,
     certificates: Annotated[
         Path | None,
-        typer.Option(
-            "--certificates", metavar="FOLDER", help="The folder of the certificates, instead of the rig's."
-        ),
+        setting("--certificates", "FOLDER", "The folder of the certificates, instead of the rig's."),
     ] = None,
     detect: Annotated[
-        bool, typer.Option("--detect", help="Detect the markers here, and send only the markers.")
+        bool, switch("--detect", "Detect the markers here, and send only the markers.")
     ] = False,
     calibration: Calibrations = None,
     corners: Corners = None,
     seconds: Annotated[
-        float | None,
-        typer.Option(min=0.1, metavar="SECONDS", help="Stop after this time."),
+        float | None, setting("--seconds", "SECONDS", "Stop after this time.", min=0.1)
     ] = None,
     force: Force = False,
 ) -> None:
@@ -72,8 +69,6 @@ def node(
     from ipsys_log.capture.nodes.centre import is_of_node
     from ipsys_log.capture.nodes.network import read_network
     from ipsys_log.engine.request import Request
-    from ipsys_log.errors import IpsysError
-    from ipsys_log.extras import check_installed
 
     check_installed("node needs", "zenoh")
     if not camera:
@@ -99,19 +94,13 @@ def node(
 def _new_log(camera: str) -> Path:
     """Return the name of a new log: the camera and the time, in UTC."""
     from ipsys_log.capture.frames import Clock
-    from ipsys_log.units import format_time
 
     digits = "".join(sign for sign in format_time(Clock().now_ns())[:19] if sign.isdigit())
     return Path(f"{camera}_{digits[:8]}_{digits[8:]}.mcap")
 
 
 def _send(
-    lab: Lab,
-    network: NodeNetwork,
-    target: Path,
-    seconds: float | None,
-    request: Request | None,
-    force: bool,
+    lab: Lab, network: NodeNetwork, target: Path, seconds: float | None, request: Request | None, force: bool
 ) -> None:
     """Record the camera and send its frames, or with a request their markers."""
     from ipsys_log import __version__

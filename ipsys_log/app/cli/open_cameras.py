@@ -16,13 +16,15 @@ from typing import TYPE_CHECKING
 from ipsys_log.app.cli.console import console, remarks, say, warn
 from ipsys_log.app.cli.lab_inputs import load_lab, split_calibration
 from ipsys_log.app.cli.signals import Interrupted, stop_on_signal
+from ipsys_log.app.report.files import check_file
+from ipsys_log.errors import IpsysError
+from ipsys_log.log.location import LogLocation, is_one_of
 from ipsys_log.units import format_bytes
 
 if TYPE_CHECKING:
     from ipsys_log.app.report.cameras import LiveStatus
     from ipsys_log.capture.disk import DiskRoom
     from ipsys_log.capture.lab import Lab, OpenLab
-    from ipsys_log.log.location import LogLocation
 
 
 # The name of a log that exists only while the command runs.
@@ -88,10 +90,7 @@ def check_target(output: Path, force: bool, files: Iterable[tuple[str, LogLocati
         The log exists, its folder does not exist, or the folder accepts no files or no such file name; with
         ``force``, another process is writing the log.
     """
-    from ipsys_log.app.report.files import check_file
-    from ipsys_log.errors import IpsysError
     from ipsys_log.log.journal import DISK, check_free, check_locks, journal_path, open_locked
-    from ipsys_log.log.location import is_one_of
 
     try:
         journal_path(output).exists()
@@ -204,7 +203,6 @@ def record_now(lab: Lab, seconds: float, keep: Path | None = None) -> Iterator[P
     IpsysError
         The cameras do not send. Errors of the block do not name the temporary file.
     """
-    from ipsys_log.errors import IpsysError
     from ipsys_log.live_runs import pipeline
 
     with TemporaryDirectory(prefix="ipsys-") as folder:

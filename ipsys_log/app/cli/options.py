@@ -14,11 +14,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ipsys_log.app.cli.console import say
+from ipsys_log.app.report.files import check_figure_file
+from ipsys_log.errors import IpsysError
+from ipsys_log.log.location import LogLocation, LogUrl, parse_location
 from ipsys_log.stages import CORNERS, METHOD, StageParameter
 
 if TYPE_CHECKING:
-    from ipsys_log.log.location import LogLocation
-
     LogList = list[LogLocation]
     OneLog = LogLocation
     OtherLog = LogLocation | None
@@ -34,6 +35,7 @@ else:
 _URL_AS_PATH = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")
 
 Paths = list[Path] | Path | None
+_NOT_HERE = "is a URL; name a file or a folder on this machine"
 
 
 def is_url(path: Path) -> bool:
@@ -41,28 +43,18 @@ def is_url(path: Path) -> bool:
     return _URL_AS_PATH.match(str(path)) is not None and not path.exists()
 
 
-def read_files(given: Paths) -> Paths:
-    """Return the file, or the files, of an argument of a command that reads only files.
+def refuse_urls(why: str) -> Callable[[Paths], Paths]:
+    """Return a function that checks the files of an argument, and refuses a URL with a reason."""
 
-    Raises
-    ------
-    IpsysError
-        A URL is among them.
-    """
-    _refuse(given, "is at a URL, but this command reads files; download them first")
-    return given
+    def check(given: Paths) -> Paths:
+        _refuse(given, why)
+        return given
+
+    return check
 
 
-def appended_logs(given: Paths) -> Paths:
-    """Return the log, or the logs, that a command extends or repairs.
-
-    Raises
-    ------
-    IpsysError
-        A URL is among them.
-    """
-    _refuse(given, "is at a URL, but this command writes into the log; download the log first")
-    return given
+read_files = refuse_urls("is at a URL, but this command reads files; download them first")
+_appended = refuse_urls("is at a URL, but this command writes into the log; download the log first")
 
 
 def needs_local_files(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -72,7 +64,7 @@ def needs_local_files(command: Callable[..., Any]) -> Callable[..., Any]:
     def run(*arguments: Any, **options: Any) -> Any:
         for name, value in options.items():
             option = "-o " if name == "output" else ""
-            _refuse(value, "is a URL; name a file or a folder on this machine", option)
+            _refuse(value, _NOT_HERE, option)
         return command(*arguments, **options)
 
     return run
@@ -81,9 +73,6 @@ def needs_local_files(command: Callable[..., Any]) -> Callable[..., Any]:
 def _refuse(given: object, why: str, option: str = "") -> None:
     for path in given if isinstance(given, list) else [given]:
         if isinstance(path, Path) and is_url(path):
-            from ipsys_log.errors import IpsysError
-            from ipsys_log.log.location import LogUrl
-
             url = LogUrl(str(path).replace(":/", "://", 1))
             raise IpsysError(f"{option}{url}: {why}")
 
@@ -93,12 +82,21 @@ Option = tuple[Any, Any]
 REQUIRED = inspect.Parameter.empty
 
 
+def setting(names: str, metavar: str | None, text: str, **settings: Any) -> Any:
+    """Return the description of an option with a value; other names follow the first one after a comma."""
+    return typer.Option(*names.split(","), metavar=metavar, help=text, **settings)
+
+
+def switch(names: str, text: str, **settings: Any) -> Any:
+    """Return the description of an option without a value."""
+    return setting(names, None, text, **settings)
+
+
 def option(
-    kind: Any, name: str, metavar: str | None, text: str, default: Any = None, **settings: Any
+    kind: Any, names: str, metavar: str | None, text: str, default: Any = None, **settings: Any
 ) -> Option:
-    """Return an option; other names follow the first one after a comma."""
-    names = name.split(",")
-    return Annotated[kind, typer.Option(*names, metavar=metavar, help=text, **settings)], default
+    """Return an option of a table."""
+    return Annotated[kind, setting(names, metavar, text, **settings)], default
 
 
 def flag(name: str, text: str, **settings: Any) -> Option:
@@ -113,8 +111,10 @@ def stage_option(parameter: StageParameter) -> Option:
     return option(parameter.kind, name, parameter.metavar, parameter.help, parameter.default, **least)
 
 
-def with_options(options: Mapping[str, Option]) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Give a command the options of a table, by the names of its parameters."""
+def with_options(
+    options: Mapping[str, Option], name: str | None = None, text: str | None = None
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Give a command the options of a table, by the names of its parameters; and a name and a help text."""
     keyword = inspect.Parameter.KEYWORD_ONLY
 
     def decorate(work: Callable[..., None]) -> Callable[..., None]:
@@ -128,6 +128,8 @@ def with_options(options: Mapping[str, Option]) -> Callable[[Callable[..., None]
         ]
         command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         command.__annotations__ = {name: kind for name, (kind, _) in options.items()}
+        if name is not None:
+            command.__name__, command.__doc__ = name, text
         return command
 
     return decorate
@@ -142,17 +144,14 @@ def _locations(texts: list[str] | None) -> list[Any]:
 
 def _location(text: str | None) -> Any:
     """Return the log of an option, a file or a URL."""
-    from ipsys_log.log.location import parse_location
-
     return None if text is None else parse_location(text)
 
 
 log_argument = partial(typer.Argument, metavar="LOG", callback=_locations)
-one_log_argument = partial(typer.Argument, metavar="LOG", callback=_location)
 other_log_option = partial(typer.Option, metavar="LOG", callback=_location)
 file_log_argument = partial(typer.Argument, metavar="LOG", callback=read_files)
-appended_log_argument = partial(typer.Argument, metavar="LOG", callback=appended_logs)
-appended_log_option = partial(typer.Option, metavar="LOG", callback=appended_logs)
+appended_log_argument = partial(typer.Argument, metavar="LOG", callback=_appended)
+appended_log_option = partial(typer.Option, metavar="LOG", callback=_appended)
 Logs = Annotated[
     LogList, log_argument(help="Logs, files or URLs, read as one. The last log gets the results.")
 ]
@@ -166,13 +165,7 @@ _OTHER_FILES = (
 
 
 def check_present(logs: Sequence[LogLocation]) -> None:
-    """Check that the files of logs exist, before the imports of the pipeline, which take longer.
-
-    Raises
-    ------
-    LogError
-        A log is missing.
-    """
+    """Check that the files of logs exist, before the imports of the pipeline, which take longer."""
     for log in logs:
         if isinstance(log, Path) and not log.exists():
             from ipsys_log.log.byte_source import open_for_reading
@@ -181,18 +174,10 @@ def check_present(logs: Sequence[LogLocation]) -> None:
 
 
 def _named_as_log(path: Path | None) -> Path | None:
-    """Return the path of a new log, with the extension of logs.
-
-    Raises
-    ------
-    IpsysError
-        The name is that of another kind of file.
-    """
+    """Return the path of a new log, with the extension of logs; other extensions are errors."""
     if path is None or path.suffix == ".mcap" or path.is_dir() or is_url(path):
         return path
     if path.suffix.lower() in _OTHER_FILES:
-        from ipsys_log.errors import IpsysError
-
         page = "; ipsys report --html FILE writes a page" if path.suffix.lower() in (".html", ".htm") else ""
         raise IpsysError(f"-o {path}: the name of a new log ends in .mcap{page}")
     named = path.with_name(f"{path.name}.mcap")
@@ -200,65 +185,64 @@ def _named_as_log(path: Path | None) -> Path | None:
     return named
 
 
+def _figure_file(path: Path | None) -> Path | None:
+    """Return the file of a figure, after the check that it can be written in its format."""
+    _refuse(path, _NOT_HERE)
+    if path is not None:
+        check_figure_file(path, "--plot")
+    return path
+
+
 def figure_option(subject: str) -> Any:
-    """Return the option for the file of a figure, which is checked by `report.files.check_figure_file`."""
-    return typer.Option("--plot", metavar="FILE", help=f"Draw {subject}: .png, .pdf, .svg or .jpg.")
+    """Return the description of the option ``--plot``."""
+    return setting("--plot", "FILE", f"Draw {subject}: .png, .pdf, .svg or .jpg.", callback=_figure_file)
 
 
 # The options that every command uses for the name of a new log.
 log_option = partial(typer.Option, "--output", "-o", metavar="LOG", callback=_named_as_log)
 NewLog = Annotated[Path, log_option(help="The log to write, with a name that ends in .mcap.")]
 RigFile = Annotated[
-    Path | None,
-    typer.Option("--rig", metavar="FILE", help="Use this rig file (lab.toml) instead of the rig in the log."),
+    Path | None, setting("--rig", "FILE", "Use this rig file (lab.toml) instead of the rig in the log.")
 ]
 Calibrations = Annotated[
     list[str] | None,
-    typer.Option(
+    setting(
         "--calibration",
-        metavar="CAMERA=FILE",
-        help="Use these camera intrinsics: a calibration file of OpenCV, ROS, Kalibr or others, or a "
+        "CAMERA=FILE",
+        "Use these camera intrinsics: a calibration file of OpenCV, ROS, Kalibr or others, or a "
         "log with them. Repeat it for each camera; a log without CAMERA= gives the intrinsics of all.",
     ),
 ]
 Corners = stage_option(CORNERS)[0]
 Method = stage_option(METHOD)[0]
 Only = Annotated[
-    list[str] | None,
-    typer.Option("--camera", metavar="NAME", help="Use only this camera of the rig; repeat it for several."),
+    list[str] | None, setting("--camera", "NAME", "Use only this camera of the rig; repeat it for several.")
 ]
-Force = Annotated[bool, typer.Option("--force", help="Overwrite an existing log of this name.")]
-Overwrite = Annotated[
-    bool, typer.Option("--overwrite", "--force", help="Replace an existing log of this name.")
-]
+Force = Annotated[bool, switch("--force", "Overwrite an existing log of this name.")]
+Overwrite = Annotated[bool, switch("--overwrite,--force", "Replace an existing log of this name.")]
 Host = Annotated[
     str | None,
-    typer.Option(
+    setting(
         "--host",
-        metavar="ADDRESS",
-        help="Let a phone in this network open the page: 0.0.0.0 for all addresses of this machine, or "
+        "ADDRESS",
+        "Let a phone in this network open the page: 0.0.0.0 for all addresses of this machine, or "
         "one address. The page has a new secret at each start. Default: only this machine.",
     ),
 ]
-Port = Annotated[
-    int,
-    typer.Option(min=0, max=65535, metavar="PORT", help="Port of the page; 0 for any free port."),
-]
-RigNow = Annotated[
-    Path, typer.Option("--rig", metavar="FILE", help="The rig file, with a source for each camera.")
-]
+Port = Annotated[int, setting("--port", "PORT", "Port of the page; 0 for any free port.", min=0, max=65535)]
+RigNow = Annotated[Path, setting("--rig", "FILE", "The rig file, with a source for each camera.")]
 Terminal = Annotated[
-    bool, typer.Option("--terminal", help="Ask for the measurements in the terminal instead of on a page.")
+    bool, switch("--terminal", "Ask for the measurements in the terminal instead of on a page.")
 ]
 FittedModels = Annotated[
     list[str] | None,
-    typer.Option(
+    setting(
         "--model",
-        metavar="NAME",
-        help="Model of this log, such as best; repeat it for several. The first one is shown, streamed and "
+        "NAME",
+        "Model of this log, such as best; repeat it for several. The first one is shown, streamed and "
         "used by robots. Default: poly, if the log has it.",
     ),
 ]
-Seconds = Annotated[float | None, typer.Option(min=0.1, metavar="SECONDS", help="Stop after this time.")]
-Train = Annotated[str, typer.Option(metavar="LABEL", help="Fit on the measurements with this label.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+Seconds = Annotated[float | None, setting("--seconds", "SECONDS", "Stop after this time.", min=0.1)]
+Train = Annotated[str, setting("--train", "LABEL", "Fit on the measurements with this label.")]
+AsJson = Annotated[bool, switch("--json", "Print JSON.")]

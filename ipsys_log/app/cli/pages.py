@@ -7,9 +7,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
-import typer
-
 from ipsys_log.app.cli.console import console, remarks, say
+from ipsys_log.app.cli.options import setting, switch
+from ipsys_log.errors import IpsysError
 
 if TYPE_CHECKING:
     from ipsys_log.app.report.cameras import LiveStatus
@@ -20,21 +20,21 @@ if TYPE_CHECKING:
     from ipsys_log.live_runs.player import Player
     from ipsys_log.live_runs.survey.scene import MeasuringScene
     from ipsys_log.messages import Model
-    from ipsys_log.sinks.streams.settings import Stream
+    from ipsys_log.sinks.streams.opening import Stream
 
 _USUAL_PORT = 8000
 _GAP = 4
 _CODE_STYLE = "#ffffff on #000000"
 
-Web = Annotated[bool, typer.Option("--web", help="Show a page, the dashboard, for any number of browsers.")]
+Web = Annotated[bool, switch("--web", "Show a page, the dashboard, for any number of browsers.")]
 WebPort = Annotated[
     int | None,
-    typer.Option(
+    setting(
         "--web-port",
+        "PORT",
+        "Serve the dashboard on this port instead of 8000; 0 for any free port.",
         min=0,
         max=65535,
-        metavar="PORT",
-        help="Serve the dashboard on this port instead of 8000; 0 for any free port.",
     ),
 ]
 
@@ -57,9 +57,10 @@ def say_faults(page: PageServer, name: str = "the measuring page") -> None:
 @contextmanager
 def serve_measuring(scene: MeasuringScene, host: str | None, port: int) -> Iterator[PageServer]:
     """Serve the measuring page until the block ends."""
-    from ipsys_log.app.web.server import serve
+    from ipsys_log.app.web.app import build_app
+    from ipsys_log.app.web.server import serve_app
 
-    with serve(scene, host, port) as page:
+    with serve_app(build_app(scene), host, port) as page:
         print_code(page.url, host is not None)
         try:
             yield page
@@ -81,21 +82,14 @@ def plan_dashboard(
     """Check that a dashboard can be served, before a camera is opened; None without a dashboard.
 
     All modules are loaded here: no frame must wait for them.
-
-    Raises
-    ------
-    IpsysError
-        The port is in use, or an option has no effect.
     """
-    port = _checked_port(is_wanted, port)
+    port = check_dashboard(is_wanted, host, port)
     if not is_wanted:
         return None
     import ipsys_log.app.web.dashboard.app  # noqa: F401
-    from ipsys_log.app.web.server import check_port_free
     from ipsys_log.engine.graph import copy_model
     from ipsys_log.engine.request import wanted_models
 
-    check_port_free(host, port, "--web-port")
     first, *_ = wanted_models(request)
     return DashboardPlan(host, port, copy_model(request, first)[1])
 
@@ -111,11 +105,7 @@ def serve_dashboard(
 ) -> Iterator[list[Dashboard]]:
     """Serve the dashboard of a live recording until the end of the block, and print its address.
 
-    Parameters
-    ----------
-    plan : None: there is no dashboard.
-    opened, status : the open cameras, and the status on the screen.
-    log, run, streams : the log that is written, the run of the shown tracks, and the streams of positions.
+    Without a plan, there is no dashboard.
     """
     if plan is None:
         yield []
@@ -127,15 +117,11 @@ def serve_dashboard(
         yield [dashboard]
 
 
-def check_playback_page(is_wanted: bool, host: str | None, port: int | None) -> int:
-    """Check that the dashboard of a playback can be served; return its port.
-
-    Raises
-    ------
-    IpsysError
-        The port is in use, or an option has no effect.
-    """
-    port = _checked_port(is_wanted, port)
+def check_dashboard(is_wanted: bool, host: str | None, port: int | None) -> int:
+    """Check that a dashboard can be served, and that its option has an effect; return its port."""
+    if port is not None and not is_wanted:
+        raise IpsysError("--web-port: has no effect without --web; add --web")
+    port = _USUAL_PORT if port is None else port
     if is_wanted:
         from ipsys_log.app.web.server import check_port_free
 
@@ -173,14 +159,6 @@ def _serve(dashboard: Dashboard, host: str | None, port: int, has_viewers: bool)
             yield
         finally:
             say_faults(page, "the dashboard")
-
-
-def _checked_port(is_wanted: bool, port: int | None) -> int:
-    from ipsys_log.errors import IpsysError
-
-    if port is not None and not is_wanted:
-        raise IpsysError("--web-port: has no effect without --web; add --web")
-    return _USUAL_PORT if port is None else port
 
 
 def _print_addresses(page: PageServer, is_secret: bool) -> None:

@@ -4,50 +4,35 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from time import sleep
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
+from ipsys_log.app.cli import options as cli
 from ipsys_log.app.cli.console import say, warn
-from ipsys_log.app.cli.measure import show_measured
 from ipsys_log.app.cli.open_cameras import MODEL, check_target, open_cameras, prepare_lab
-from ipsys_log.app.cli.options import (
-    Calibrations,
-    Corners,
-    FittedModels,
-    Force,
-    Host,
-    Method,
-    NewLog,
-    OneLog,
-    Only,
-    OtherLog,
-    Port,
-    RigNow,
-    Seconds,
-    Terminal,
-    other_log_option,
-)
+from ipsys_log.app.cli.options import other_log_option, switch
 from ipsys_log.app.cli.pages import Web, WebPort, plan_dashboard, serve_dashboard, serve_measuring
+from ipsys_log.app.cli.points import show_measured
 from ipsys_log.app.cli.signals import SAVED, allow_interrupt, runs_until_stopped
 from ipsys_log.app.cli.stream import StreamOptions, choose_streams, takes_streams
+from ipsys_log.errors import IpsysError
+from ipsys_log.extras import check_installed
+from ipsys_log.log.location import LogLocation
 
 if TYPE_CHECKING:
     from ipsys_log.capture.lab import Lab, OpenLab
     from ipsys_log.capture.multiplexer import LiveCameras
     from ipsys_log.engine.request import Request
     from ipsys_log.live_runs.survey.live import LiveScene
-    from ipsys_log.log.location import LogLocation
     from ipsys_log.messages import Measurement, Model
     from ipsys_log.sinks.rerun.viewer import LiveView
     from ipsys_log.sinks.sink import Sink
-    from ipsys_log.sinks.streams.settings import StreamSettings
+    from ipsys_log.sinks.streams import StreamSettings
 
-View = Annotated[bool, typer.Option("--view", help="Show cameras and robots in Rerun during the recording.")]
+View = Annotated[bool, switch("--view", "Show cameras and robots in Rerun during the recording.")]
 
 _TURN_S = 0.05
 # After this time, the markers in the images and their stationary intervals are known.
@@ -57,39 +42,31 @@ _NOT_BEGUN = "stopped before the first frame was recorded; no log was written"
 
 @runs_until_stopped
 def record(
-    output: NewLog,
-    rig: RigNow = Path("lab.toml"),
-    camera: Only = None,
-    calibration: Calibrations = None,
-    detect: Annotated[bool, typer.Option("--detect", help="Detect the markers and write them, too.")] = False,
-    corners: Corners = None,
+    output: cli.NewLog,
+    rig: cli.RigNow = Path("lab.toml"),
+    camera: cli.Only = None,
+    calibration: cli.Calibrations = None,
+    detect: Annotated[bool, switch("--detect", "Detect the markers and write them, too.")] = False,
+    corners: cli.Corners = None,
     measure: Annotated[
-        bool,
-        typer.Option(
-            "--measure", help="Enter tape measurements during the recording, on a page for the phone."
-        ),
+        bool, switch("--measure", "Enter tape measurements during the recording, on a page for the phone.")
     ] = False,
     points_only: Annotated[
-        bool,
-        typer.Option(
-            "--points-only", help="With --measure: keep only about 1 s of frames of each measured point."
-        ),
+        bool, switch("--points-only", "With --measure: keep only about 1 s of frames of each measured point.")
     ] = False,
-    terminal: Terminal = False,
-    host: Host = None,
-    port: Port = 8000,
+    terminal: cli.Terminal = False,
+    host: cli.Host = None,
+    port: cli.Port = 8000,
     model_from: Annotated[
-        OtherLog,
+        cli.OtherLog,
         other_log_option(
             "--model-from",
             help="With --measure: compare each point with the model of this log, a file or a URL.",
         ),
     ] = None,
-    seconds: Seconds = None,
-    force: Force = False,
-    as_json: Annotated[
-        bool, typer.Option("--json", hidden=True, help="With --points-only: print JSON.")
-    ] = False,
+    seconds: cli.Seconds = None,
+    force: cli.Force = False,
+    as_json: Annotated[bool, switch("--json", "With --points-only: print JSON.", hidden=True)] = False,
 ) -> None:
     """Record the camera frames, unchanged, until Ctrl-C.
 
@@ -106,8 +83,6 @@ def record(
     allow_interrupt(SAVED if points_only else _NOT_BEGUN)
     from ipsys_log.capture.live_plan import check_start
     from ipsys_log.engine.request import Request
-    from ipsys_log.errors import IpsysError
-    from ipsys_log.extras import check_installed
     from ipsys_log.live_runs import pipeline
 
     if not measure:
@@ -250,24 +225,24 @@ def _ask_beside(work: Callable[[], Any], scene: LiveScene, cameras: LiveCameras)
 @runs_until_stopped
 @takes_streams
 def live(
-    output: NewLog,
+    output: cli.NewLog,
     model_from: Annotated[
-        OneLog,
+        cli.OneLog,
         other_log_option("--model-from", help="The log with the fitted model to apply, a file or a URL."),
     ],
-    rig: RigNow = Path("lab.toml"),
-    model: FittedModels = None,
-    camera: Only = None,
-    calibration: Calibrations = None,
-    corners: Corners = None,
-    method: Method = "perimeter",
+    rig: cli.RigNow = Path("lab.toml"),
+    model: cli.FittedModels = None,
+    camera: cli.Only = None,
+    calibration: cli.Calibrations = None,
+    corners: cli.Corners = None,
+    method: cli.Method = "perimeter",
     view: View = False,
     web: Web = False,
     web_port: WebPort = None,
     *,
     streams: StreamOptions,
-    seconds: Seconds = None,
-    force: Force = False,
+    seconds: cli.Seconds = None,
+    force: cli.Force = False,
 ) -> None:
     """Track robots live: record, and process every frame with all stages up to fuse, until Ctrl-C.
 
@@ -281,9 +256,8 @@ def live(
     allow_interrupt(_NOT_BEGUN)
     from ipsys_log.capture.live_plan import check_start, shown_run
     from ipsys_log.engine.request import Request
-    from ipsys_log.extras import check_installed
     from ipsys_log.live_runs import pipeline
-    from ipsys_log.sinks.streams.settings import check_streams, open_live_streams
+    from ipsys_log.sinks.streams.opening import check_streams, open_live_streams
 
     for option, is_wanted in (("--view", view), ("--rerun", streams["rerun"])):
         if is_wanted:
@@ -307,29 +281,29 @@ def live(
     with (
         open_cameras(lab, output, seconds) as (opened, status),
         open_live_streams(streamed, opened, run) as senders,
-        _page_viewer(opened, run, streamed) as pages,
+        _viewers(opened, run, streamed, view) as viewers,
         serve_dashboard(planned, opened, status, output, run, senders) as dashboards,
     ):
-        viewer = [_viewer(opened, run)] if view else []
-        sinks: list[Sink] = [status, *viewer, *pages, *dashboards, *senders]
+        sinks: list[Sink] = [status, *viewers, *dashboards, *senders]
         pipeline.live(opened.cameras, opened.settings, output, request, None, sinks, force)
 
 
-def _viewer(opened: OpenLab, run: str) -> LiveView:
-    from ipsys_log.sinks.rerun.viewer import LiveView
-
-    return LiveView(opened.rig, opened.cameras.states, run, say)
-
-
 @contextmanager
-def _page_viewer(opened: OpenLab, run: str, streamed: StreamSettings) -> Iterator[list[LiveView]]:
-    """Show the recording on a page for a browser of this machine, if the user asked for it."""
-    if not streamed.rerun:
+def _viewers(
+    opened: OpenLab, run: str, streamed: StreamSettings, has_window: bool
+) -> Iterator[list[LiveView]]:
+    """Show the recording in a window, and on a page for a browser of this machine, as the user asked."""
+    if not (has_window or streamed.rerun):
         yield []
         return
     from ipsys_log.sinks.rerun.viewer import LiveView, ViewerPage
 
-    shown = opened.cameras.states if streamed.images else ()
-    with closing(ViewerPage()) as page:
-        say(page.describe())
-        yield [LiveView(opened.rig, shown, run, say, page.show, page.name)]
+    cameras = opened.cameras.states
+    views = [LiveView(opened.rig, cameras, run, say)] if has_window else []
+    with ExitStack() as stack:
+        if streamed.rerun:
+            page = stack.enter_context(closing(ViewerPage()))
+            say(page.describe())
+            shown = cameras if streamed.images else ()
+            views.append(LiveView(opened.rig, shown, run, say, page.show, page.name))
+        yield views

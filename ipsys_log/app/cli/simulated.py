@@ -5,11 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
-from ipsys_log.app.cli.console import console, print_json, progress_bar, say
+from ipsys_log.app.cli import options as cli
+from ipsys_log.app.cli.console import console, print_result, progress_bar, say
 from ipsys_log.app.cli.open_cameras import MODEL, check_target
-from ipsys_log.app.cli.options import AsJson, FittedModels, Force, NewLog, OneLog, other_log_option
+from ipsys_log.app.cli.options import other_log_option, setting, switch
 from ipsys_log.app.cli.signals import allow_interrupt, runs_until_stopped, say_kept, stop_on_signal
 from ipsys_log.plain_text import shell_words
 
@@ -19,45 +18,33 @@ if TYPE_CHECKING:
 
 Paths = Annotated[
     list[str] | None,
-    typer.Option(
-        "--path", metavar="ROBOT=X,Y...", help='Waypoints of a robot in m: "robot_0=0.5,0.5 0.5,2.5 2,2".'
-    ),
+    setting("--path", "ROBOT=X,Y...", 'Waypoints of a robot in m: "robot_0=0.5,0.5 0.5,2.5 2,2".'),
 ]
 Failures = Annotated[
     list[str] | None,
-    typer.Option(
-        "--fail", metavar="CAMERA=START:SECONDS", help="Let a camera fail: white=20:5 is at 20 s, for 5 s."
-    ),
+    setting("--fail", "CAMERA=START:SECONDS", "Let a camera fail: white=20:5 is at 20 s, for 5 s."),
 ]
 
 
 def simulate(
-    output: NewLog,
+    output: cli.NewLog,
     cameras: Annotated[
         str | None,
-        typer.Option(
-            metavar="GRID",
-            help="Columns x rows of the cameras of a hall, such as 6x4. Default: a lab with three cameras.",
+        setting(
+            "--cameras",
+            "GRID",
+            "Columns x rows of the cameras of a hall, such as 6x4. Default: a lab with three cameras.",
         ),
     ] = None,
     seed: Annotated[
-        int | None,
-        typer.Option(metavar="N", help="Seed of the random numbers. The same seed gives the same bytes."),
+        int | None, setting("--seed", "N", "Seed of the random numbers. The same seed gives the same bytes.")
     ] = None,
     settings: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Read settings from a TOML file; docs/data.md lists them.",
-        ),
+        Path | None, setting("--settings", "FILE", "Read settings from a TOML file; docs/data.md lists them.")
     ] = None,
     changes: Annotated[
         list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="NAME=VALUE",
-            help="Change a setting, such as drive_s=4; repeat it for several.",
-        ),
+        setting("--set", "NAME=VALUE", "Change a setting, such as drive_s=4; repeat it for several."),
     ] = None,
 ) -> None:
     """Render a simulated lab with ground truth: calibration points, then a drive of the robots.
@@ -86,47 +73,41 @@ def simulate(
 
 @runs_until_stopped
 def drive(
-    output: NewLog,
+    output: cli.NewLog,
     model_from: Annotated[
-        OneLog,
+        cli.OneLog,
         other_log_option(
             "--model-from", help="The log of the simulated lab with the model, a file or a URL."
         ),
     ],
-    model: FittedModels = None,
-    robots: Annotated[int, typer.Option("--robots", help="Number of robots, 1 to 3; their paths cross.")] = 1,
+    model: cli.FittedModels = None,
+    robots: Annotated[int, switch("--robots", "Number of robots, 1 to 3; their paths cross.")] = 1,
     path: Paths = None,
     program: Annotated[
         Path | None,
-        typer.Option(
-            "--program", metavar="FILE", help="The program of the robots (default: the example of ipsys)."
-        ),
+        setting("--program", "FILE", "The program of the robots (default: the example of ipsys)."),
     ] = None,
-    over: Annotated[
-        str, typer.Option("--over", metavar="udp|vrpn|ros2", help="The stream of the positions.")
-    ] = "udp",
+    over: Annotated[str, setting("--over", "udp|vrpn|ros2", "The stream of the positions.")] = "udp",
     loss: Annotated[
-        float, typer.Option("--loss", metavar="SHARE", help="Lose this share of the datagrams, such as 0.05.")
+        float, setting("--loss", "SHARE", "Lose this share of the datagrams, such as 0.05.")
     ] = 0.0,
-    delay_ms: Annotated[float, typer.Option("--delay-ms", help="Delay the datagrams, in ms.")] = 0.0,
+    delay_ms: Annotated[float, switch("--delay-ms", "Delay the datagrams, in ms.")] = 0.0,
     fail: Failures = None,
     lockstep: Annotated[
         bool,
-        typer.Option(
-            "--lockstep", help="Use simulated time: the result does not depend on the speed of the machine."
-        ),
+        switch("--lockstep", "Use simulated time: the result does not depend on the speed of the machine."),
     ] = False,
-    rate_hz: Annotated[float, typer.Option("--rate-hz", help="Frames per second of each camera.")] = 5.0,
+    rate_hz: Annotated[float, switch("--rate-hz", "Frames per second of each camera.")] = 5.0,
     seed: Annotated[
-        int, typer.Option("--seed", help="Seed of the start, the wheels, the noise and the lost datagrams.")
+        int, switch("--seed", "Seed of the start, the wheels, the noise and the lost datagrams.")
     ] = 0,
-    lab_seed: Annotated[int, typer.Option("--lab-seed", help="Seed of the simulated lab.")] = 0,
+    lab_seed: Annotated[int, switch("--lab-seed", "Seed of the simulated lab.")] = 0,
     port: Annotated[
-        int, typer.Option("--port", min=0, max=65000, help="First of the used ports; 0: free ports.")
+        int, switch("--port", "First of the used ports; 0: free ports.", min=0, max=65000)
     ] = 9870,
-    seconds: Annotated[float, typer.Option("--seconds", min=1.0, help="Stop after this time.")] = 300.0,
-    as_json: AsJson = False,
-    force: Force = False,
+    seconds: Annotated[float, switch("--seconds", "Stop after this time.", min=1.0)] = 300.0,
+    as_json: cli.AsJson = False,
+    force: cli.Force = False,
 ) -> None:
     """Let robots drive in the simulated lab, each by a program that gets only streamed positions.
 
@@ -179,8 +160,5 @@ def _drive(run: RobotRun, output: Path, request: Request, force: bool, as_json: 
     drive_robots(run, output, request, force, say, stop_on_signal)
     with Session([output]) as session:
         result = read_robot_run(session)
-    if as_json:
-        print_json(robot_run_json(result))
-        return
-    console.print(robot_run_tables(result))
-    console.print(f"{output} written; its figure: ipsys report {shell_words(output)}")
+    written = f"{output} written; its figure: ipsys report {shell_words(output)}"
+    print_result(robot_run_json(result), (robot_run_tables(result), written), as_json)

@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from ipsys_log.app.cli.console import console, print_json, print_outcomes, progress_bar, say
+from ipsys_log.app.cli import options as cli
+from ipsys_log.app.cli.console import print_outcomes, print_result, progress_bar, say
 from ipsys_log.app.cli.lab_inputs import cameras_of, load_calibrations, load_matching_rig
 from ipsys_log.app.cli.options import (
-    REQUIRED,
-    AsJson,
-    Calibrations,
-    Logs,
-    Option,
-    RigFile,
     check_present,
     figure_option,
     flag,
@@ -27,14 +22,19 @@ from ipsys_log.app.cli.options import (
     with_options,
 )
 from ipsys_log.app.cli.signals import say_kept
+from ipsys_log.app.report.files import check_folder
+from ipsys_log.errors import IpsysError
+from ipsys_log.extras import check_installed
+from ipsys_log.log.location import LogLocation, parse_location
 from ipsys_log.stages import ENTRIES, parameters_until
 
 if TYPE_CHECKING:
+    from rich.console import RenderableType
+
     from ipsys_log.app.report.accuracy import Accuracy
     from ipsys_log.engine.provenance import Outcome
     from ipsys_log.engine.request import Request
     from ipsys_log.log.dataset import Session
-    from ipsys_log.log.location import LogLocation
 
 STAGE_NAMES = tuple(entry.name for entry in ENTRIES)
 
@@ -44,10 +44,10 @@ def _stage_lines() -> str:
 
 
 # The options of every stage, and of the printed results.
-_SHARED: dict[str, Option] = {
-    "logs": (Logs, REQUIRED),
-    "rig": (RigFile, None),
-    "calibration": (Calibrations, None),
+_SHARED: dict[str, cli.Option] = {
+    "logs": (cli.Logs, cli.REQUIRED),
+    "rig": (cli.RigFile, None),
+    "calibration": (cli.Calibrations, None),
     "run": option(
         str | None, "--run", "NAME", "Name of the new run, instead of edges, poly, poly_2 ..."
     ),
@@ -60,9 +60,9 @@ _SHARED: dict[str, Option] = {
         "same with any number.",
         min=1,
     ),
-    "as_json": (AsJson, False),
+    "as_json": (cli.AsJson, False),
 }  # fmt: skip
-_PRINTS: dict[str, Option] = {
+_PRINTS: dict[str, cli.Option] = {
     "plot": (Annotated[Path | None, figure_option("the floor and the errors")], None),
     "details": flag(
         "--details", "Print details, too: errors by camera, every outlier, models by number of points."
@@ -110,7 +110,7 @@ Examples
 """
 
 
-def options_until(name: str | None) -> dict[str, Option]:
+def options_until(name: str | None) -> dict[str, cli.Option]:
     """Return the options of a stage, with the parameters of all stages up to it; None: of all stages."""
     options = dict(_SHARED)
     as_json = options.pop("as_json")
@@ -118,18 +118,6 @@ def options_until(name: str | None) -> dict[str, Option]:
         options[parameter.name] = stage_option(parameter)
     ordered = {name: options[name] for name in _ORDER if name in options}
     return {**ordered, **options, "as_json": as_json}
-
-
-def build_command(
-    name: str, text: str, options: Mapping[str, Option], work: Callable[..., None]
-) -> Callable[..., None]:
-    """Return a command with a help text and these options."""
-
-    def command(**given: Any) -> None:
-        work(**given)
-
-    command.__name__, command.__doc__ = name, text
-    return with_options(options)(command)
 
 
 def _request(logs: Sequence[LogLocation], **given: Any) -> Request:
@@ -149,7 +137,6 @@ def _request(logs: Sequence[LogLocation], **given: Any) -> Request:
 def replay_options(**given: Any) -> dict[str, Any]:
     """Return the options of a command without rig and intrinsics as those of `python_api.replay`."""
     from ipsys_log.engine.request import Request
-    from ipsys_log.log.location import parse_location
     from ipsys_log.messages.rig_file import check_name
 
     run, models = given.pop("run"), given.pop("model", None) or ()
@@ -229,8 +216,6 @@ def _kept_runs(logs: Sequence[LogLocation], output: Path | None) -> Callable[[Se
 
 
 def _replay(until: str | None, **given: Any) -> None:
-    from ipsys_log.errors import IpsysError
-
     if until is not None and until not in STAGE_NAMES:
         raise IpsysError(f"--until {until}: is not a stage; use one of {', '.join(STAGE_NAMES)}")
     unread = {parameter.name: parameter for parameter in parameters_until(None)}
@@ -251,27 +236,16 @@ def _derive(
     details: bool = False,
     **given: Any,
 ) -> None:
-    if plot is not None or plots is not None:
-        _check_figures(logs, plot, plots)
-    with derive(logs, until, **given) as (session, outcomes, accuracies):
-        drawn = _draw(session, accuracies, plot, plots)
-    if as_json:
-        _print_json(outcomes, accuracies)
-    else:
-        _print(accuracies, details)
-    for line in drawn:
-        say(line)
-
-
-def _check_figures(logs: Sequence[LogLocation], plot: Path | None, plots: Path | None) -> None:
-    from ipsys_log.app.report.files import check_figure_file, check_folder
-    from ipsys_log.extras import check_installed
-
-    if plot is not None:
-        check_figure_file(plot, "--plot", logs)
     if plots is not None:
         check_installed("--plots needs", "matplotlib")
         check_folder(plots, "--plots")
+    with derive(logs, until, **given) as (session, outcomes, accuracies):
+        drawn = _draw(session, accuracies, plot, plots)
+    print_result(_result(outcomes, accuracies), _parts(accuracies, details), as_json)
+    if accuracies and not (details or as_json):
+        say("--details prints errors by camera, every outlier and models by number of points")
+    for line in drawn:
+        say(line)
 
 
 def _draw(
@@ -293,17 +267,16 @@ def _draw(
     return drawn
 
 
-def _print_json(outcomes: Sequence[Outcome], accuracies: Sequence[Accuracy]) -> None:
+def _result(outcomes: Sequence[Outcome], accuracies: Sequence[Accuracy]) -> dict[str, Any]:
     from ipsys_log.app.report.accuracy import accuracy_json
     from ipsys_log.app.report.summary import answer_json
 
     stages = [{"stage": o.stage, "run": o.run, "new": o.fresh, "messages": o.messages} for o in outcomes]
-    results = {**answer_json(accuracies), **accuracy_json(accuracies), "stages": stages}
-    print_json(results)
+    return {**answer_json(accuracies), **accuracy_json(accuracies), "stages": stages}
 
 
-def _print(accuracies: Sequence[Accuracy], details: bool) -> None:
-    """Print the answer first, then one table, and on request all numbers."""
+def _parts(accuracies: Sequence[Accuracy], details: bool) -> Iterator[RenderableType]:
+    """Yield the answer first, then one table, and on request all numbers."""
     from ipsys_log.app.report.summary import answer_text
     from ipsys_log.app.report.tables import accuracy_tables, models_table, trajectory_table
 
@@ -311,10 +284,8 @@ def _print(accuracies: Sequence[Accuracy], details: bool) -> None:
     further = [*accuracy_tables(accuracies), trajectory_table(accuracies)] if details else []
     for part in [*parts, *further]:
         if part is not None:
-            console.print(part)
-            console.print()
-    if accuracies and not details:
-        say("--details prints errors by camera, every outlier and models by number of points")
+            yield part
+            yield ""
 
 
 def _remark(outcomes: list[Outcome], target: LogLocation | None) -> None:
@@ -330,15 +301,7 @@ def _remark(outcomes: list[Outcome], target: LogLocation | None) -> None:
 
 _options = options_until(None)
 _json = _options.pop("as_json")
-replay = build_command(
-    "replay",
-    _REPLAY,
-    {"logs": _options.pop("logs"), "until": _UNTIL, **_options, **_PRINTS, "as_json": _json},
-    _replay,
-)
-evaluate = build_command(
-    "evaluate",
-    _EVALUATE,
-    {**options_until("evaluate"), "plots": _PRINTS["plots"], "details": _PRINTS["details"]},
-    partial(_derive, "evaluate"),
-)
+_options = {"logs": _options.pop("logs"), "until": _UNTIL, **_options, **_PRINTS, "as_json": _json}
+replay = with_options(_options, "replay", _REPLAY)(_replay)
+_options = {**options_until("evaluate"), "plots": _PRINTS["plots"], "details": _PRINTS["details"]}
+evaluate = with_options(_options, "evaluate", _EVALUATE)(partial(_derive, "evaluate"))

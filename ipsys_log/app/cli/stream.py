@@ -11,22 +11,22 @@ import sys
 import threading
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-import typer
+from typing import TYPE_CHECKING, Annotated, Any, get_origin, get_type_hints
 
 from ipsys_log.app.cli.console import say
-from ipsys_log.app.cli.options import LogList, Option, flag, log_argument, option
-from ipsys_log.app.cli.pages import Web, WebPort, check_playback_page, serve_playback
+from ipsys_log.app.cli.options import LogList, Option, flag, log_argument, option, setting, switch
+from ipsys_log.app.cli.pages import Web, WebPort, check_dashboard, serve_playback
 from ipsys_log.app.cli.signals import allow_interrupt, runs_until_stopped, stop_on_signal, writes_nothing
+from ipsys_log.errors import IpsysError
+from ipsys_log.extras import check_installed
+from ipsys_log.sinks.streams import StreamOption, StreamSettings
 
 if TYPE_CHECKING:
     from ipsys_log.live_runs.player import Player
     from ipsys_log.messages import Rig
-    from ipsys_log.sinks.streams.settings import StreamSettings
 
 # The options of the streams, by the names of `choose_streams`.
 StreamOptions = dict[str, Any]
@@ -39,96 +39,44 @@ _KEY = re.compile(r"\x1b\[[A-D]|.", re.DOTALL)
 _RATES = (0.1, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0)
 
 Logs = Annotated[LogList, log_argument(help="Logs to play, files or URLs, merged by time.")]
-RigFile = Annotated[
-    Path | None,
-    typer.Option("--rig", metavar="FILE", help="Open the streams of this rig file (lab.toml)."),
-]
-Rate = Annotated[
-    float, typer.Option("--rate", metavar="FACTOR", help="Play faster or slower: 2 is twice as fast.")
-]
-Loop = Annotated[bool, typer.Option("--loop", help="Begin again at the end.")]
-StartPaused = Annotated[bool, typer.Option("--start-paused", help="Wait for a key at the start.")]
+RigFile = Annotated[Path | None, setting("--rig", "FILE", "Open the streams of this rig file (lab.toml).")]
+Rate = Annotated[float, setting("--rate", "FACTOR", "Play faster or slower: 2 is twice as fast.")]
+Loop = Annotated[bool, switch("--loop", "Begin again at the end.")]
+StartPaused = Annotated[bool, switch("--start-paused", "Wait for a key at the start.")]
 StartOffset = Annotated[
-    float,
-    typer.Option("--start-offset", metavar="SECONDS", help="Begin so long after the first position."),
+    float, setting("--start-offset", "SECONDS", "Begin so long after the first position.")
 ]
-Run = Annotated[
-    str | None,
-    typer.Option("--run", metavar="NAME", help="Play the tracks of this run. Default: the newest."),
-]
+Run = Annotated[str | None, setting("--run", "NAME", "Play the tracks of this run. Default: the newest.")]
 Topics = Annotated[
     list[str] | None,
-    typer.Option(
-        "--topics",
-        metavar="TOPIC",
-        help="Play this topic instead, such as /truth/tracks; repeat it for several.",
-    ),
+    setting("--topics", "TOPIC", "Play this topic instead, such as /truth/tracks; repeat it for several."),
 ]
 Restamp = Annotated[
-    str,
-    typer.Option(
-        "--restamp",
-        metavar="original|now",
-        help="Give the positions their capture times, or the present time.",
-    ),
+    str, setting("--restamp", "original|now", "Give the positions their capture times, or the present time.")
 ]
 
 
 _PANEL = "Streams of positions"
-_option, _flag = partial(option, rich_help_panel=_PANEL), partial(flag, rich_help_panel=_PANEL)
+_option = partial(option, rich_help_panel=_PANEL)
 
 
-def _port(name: str, text: str) -> Option:
-    return _option(int | None, name, "PORT", text, min=1, max=65535)
+def _options_of(setting: str, described: StreamOption) -> Iterator[tuple[str, Option]]:
+    """Yield the option of a setting, and for a server that of its port."""
+    name = described.name or f"--{setting.replace('_', '-')}"
+    if described.metavar:
+        kind = _KINDS[setting]
+        kind = list[str] if get_origin(kind) is tuple else kind
+        yield setting, _option(kind | None, name, described.metavar, described.help)
+    else:
+        yield setting, flag(name, described.help, rich_help_panel=_PANEL)
+    if described.port is not None:
+        port = _option(int | None, f"{name}-port", "PORT", described.port_help, min=1, max=65535)
+        yield f"{setting}_port", port
 
 
-_OPTIONS: dict[str, Option] = {
-    "udp": _option(
-        list[str] | None, "--udp", "HOST:PORT",
-        "Send positions as JSON datagrams to this address; repeat it for several. 239.255.0.1:9870 is a "
-        "multicast group. docs/streams.md has receivers in Python and for ESP32.",
-    ),
-    "key": _option(
-        Path | None, "--key", "FILE", "Sign the datagrams with the key in this file (HMAC-SHA256)."
-    ),
-    "vrpn": _flag(
-        "--vrpn",
-        "Serve positions over VRPN on port 3883, as a motion-capture system: for ROS 2, MATLAB, Unity.",
-    ),
-    "vrpn_port": _port("--vrpn-port", "Serve VRPN on another port."),
-    "mavlink": _option(
-        list[str] | None, "--mavlink", "ROBOT=HOST:PORT",
-        "Send the pose of a robot to its autopilot (PX4, ArduPilot); repeat it for several. With /vision at "
-        "the end, the message is VISION_POSITION_ESTIMATE instead of ODOMETRY.",
-    ),
-    "ros2": _flag(
-        "--ros2",
-        "Publish positions to nodes of ROS 2 with rmw_zenoh, without ROS on this machine: /tf, and a pose "
-        "and odometry for each robot.",
-    ),
-    "ros2_port": _port(
-        "--ros2-port",
-        "Use the Zenoh router on this port instead of 7447; if none answers, ipsys is the router.",
-    ),
-    "ros2_domain": _option(
-        int | None, "--ros2-domain", "ID", "Publish to this domain ID of ROS 2. Default: 0."
-    ),
-    "foxglove": _flag(
-        "--foxglove",
-        "Serve positions to Foxglove on port 8765. The printed address has a new secret at each start.",
-    ),
-    "foxglove_port": _port("--foxglove-port", "Serve Foxglove on another port."),
-    "rerun": _flag("--rerun", "Show positions in Rerun, in a browser of this machine."),
-    "images": _flag("--images", "Show images, too, in Foxglove and in Rerun."),
-    "host": _option(
-        str | None, "--host", "ADDRESS",
-        "Let streams leave this machine: its address in the network, or 0.0.0.0 for all its addresses. The "
-        "dashboard of --web is then open to the network, too. Default: only this machine.",
-    ),
-    "robots": _option(
-        list[str] | None, "--robot", "NAME", "Send only this robot; repeat it for several. Default: all."
-    ),
-}  # fmt: skip
+_KINDS = get_type_hints(StreamSettings)
+_DESCRIBED = {one.name: one.metadata["option"] for one in fields(StreamSettings) if one.metadata}
+_OPTIONS = dict(pair for one in _DESCRIBED.items() for pair in _options_of(*one))
 
 
 def takes_streams(command: Callable[..., None]) -> Callable[..., None]:
@@ -173,11 +121,12 @@ def choose_streams(
         There is no stream for an option, or the rig has no such robot.
     """
     from ipsys_log.messages.rig_file import check_robots
-    from ipsys_log.sinks.streams.settings import PORTS, settings_of_rig
+    from ipsys_log.sinks.streams.opening import settings_of_rig
 
-    for name, port in PORTS.items():
-        wanted = port if options.pop(name) else None
-        options[name] = options.pop(f"{name}_port") or wanted
+    for name, described in _DESCRIBED.items():
+        if described.port is not None:
+            usual = described.port if options.pop(name) else None
+            options[name] = options.pop(f"{name}_port") or usual
     given: dict[str, Any] = {
         name: tuple(value) if isinstance(value, list) else value
         for name, value in options.items()
@@ -192,11 +141,8 @@ def choose_streams(
 
 def _check_effect(given: Collection[str], settings: StreamSettings) -> None:
     """Check that each option belongs to a stream."""
-    from ipsys_log.errors import IpsysError
-
-    names = {"robots": "robot", "ros2_domain": "ros2-domain"}
     if given and not settings:
-        name = names.get(next(iter(given)), next(iter(given)))
+        name = next(iter(given)).replace("robots", "robot").replace("_", "-")
         raise IpsysError(f"--{name}: has no effect without a stream; add one, such as --udp 127.0.0.1:9870")
     if "ros2_domain" in given and settings.ros2 is None:
         raise IpsysError("--ros2-domain: has no effect without ROS 2; add --ros2")
@@ -235,8 +181,6 @@ def stream(
         ipsys stream monday.mcap --vrpn --start-offset 20    # port 3883
     """
     allow_interrupt("stopped before the first position was sent")
-    from ipsys_log.errors import IpsysError
-    from ipsys_log.extras import check_installed
     from ipsys_log.live_runs.player import Player
     from ipsys_log.messages.rig_file import load_rig
     from ipsys_log.sinks.playback import PlaybackOptions
@@ -250,7 +194,7 @@ def stream(
     settings = choose_streams(described, folder, has_page=web, **streams)
     if not settings and not web:
         raise IpsysError("no stream is given; name one, such as --udp 127.0.0.1:9870, or add --web")
-    port = check_playback_page(web, streams["host"], web_port)
+    port = check_dashboard(web, streams["host"], web_port)
     options = PlaybackOptions(rate, loop, start_paused, start_offset, restamp == "now")
     player = Player(logs, run, topics or (), options, settings, say=say, has_dashboard=web)
     stop_on_signal(player.stop)

@@ -5,40 +5,34 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-import typer
+from typing import Annotated, Any
 
 from ipsys_log.app.cli.console import console, progress_bar, say
-from ipsys_log.app.cli.options import ReadLogs
-from ipsys_log.app.cli.stages import MORE, build_command, derive, options_until
-
-if TYPE_CHECKING:
-    from ipsys_log.log.location import LogLocation
+from ipsys_log.app.cli.options import ReadLogs, setting, switch, with_options
+from ipsys_log.app.cli.stages import MORE, derive, options_until
+from ipsys_log.app.report.files import check_file, write_files
+from ipsys_log.errors import IpsysError
+from ipsys_log.extras import check_installed
+from ipsys_log.log.location import LogLocation, file_beside
 
 _COUNTED = ("bag", "video", "pictures")
 Runs = Annotated[
-    list[str] | None,
-    typer.Option("--run", metavar="NAME", help="Show this run instead of the newest; repeat it for several."),
+    list[str] | None, setting("--run", "NAME", "Show this run instead of the newest; repeat it for several.")
 ]
 Save = Annotated[
-    Path | None,
-    typer.Option(
-        "--save", metavar="FILE", help="Write a Rerun recording (.rrd) instead of opening the viewer."
-    ),
+    Path | None, setting("--save", "FILE", "Write a Rerun recording (.rrd) instead of opening the viewer.")
 ]
 FoxgloveLayout = Annotated[
     Path | None,
-    typer.Option(
+    setting(
         "--foxglove-layout",
-        metavar="FILE",
-        help="Write a layout of Foxglove for the log (.json) instead of opening the viewer.",
+        "FILE",
+        "Write a layout of Foxglove for the log (.json) instead of opening the viewer.",
     ),
 ]
 _HTML = (
     Annotated[
-        Path | None,
-        typer.Option("--html", metavar="FILE", help="The page to write. Default: the log's name with .html."),
+        Path | None, setting("--html", "FILE", "The page to write. Default: the log's name with .html.")
     ],
     None,
 )
@@ -62,7 +56,6 @@ def view(logs: ReadLogs, run: Runs = None, save: Save = None, foxglove_layout: F
         ipsys view monday.mcap                             # the newest run
         ipsys view monday.mcap --run poly --save monday.rrd
     """
-    from ipsys_log.extras import check_installed
     from ipsys_log.log.dataset import Session
 
     if foxglove_layout is not None:
@@ -71,7 +64,11 @@ def view(logs: ReadLogs, run: Runs = None, save: Save = None, foxglove_layout: F
             return
     check_installed("view needs", "rerun")
     if save is not None:
-        _check_save(save, logs)
+        if save.suffix != ".rrd":  # Rerun opens a recording by its name
+            raise IpsysError(
+                f"--save {save}: the name of a Rerun recording ends in .rrd; use {save.stem}.rrd"
+            )
+        check_file(save, "--save", logs)
     from ipsys_log.engine.states import out_of_date_lines
     from ipsys_log.sinks.rerun.recording import write_recording
 
@@ -88,8 +85,6 @@ def view(logs: ReadLogs, run: Runs = None, save: Save = None, foxglove_layout: F
 
 
 def _write_layout(logs: Sequence[LogLocation], runs: Sequence[str], path: Path) -> None:
-    from ipsys_log.app.report.files import check_file
-    from ipsys_log.errors import IpsysError
     from ipsys_log.log.atomic_files import replacement_of
     from ipsys_log.log.dataset import Session
     from ipsys_log.sinks.foxglove_layout import make_layout
@@ -104,119 +99,78 @@ def _write_layout(logs: Sequence[LogLocation], runs: Sequence[str], path: Path) 
     say(f"{path} written; in Foxglove: Layouts, Import from file")
 
 
-def _check_save(save: Path, logs: Sequence[LogLocation]) -> None:
-    """Check that a recording can be written, and that Rerun will open it by its name."""
-    from ipsys_log.app.report.files import check_file
-    from ipsys_log.errors import IpsysError
-
-    if save.suffix != ".rrd":
-        raise IpsysError(f"--save {save}: the name of a Rerun recording ends in .rrd; use {save.stem}.rrd")
-    check_file(save, "--save", logs)
-
-
 def _report(logs: Sequence[LogLocation], output: Path | None, html: Path | None, **given: Any) -> None:
-    from ipsys_log.app.report.files import check_file, write_files
-    from ipsys_log.extras import check_installed
-
     check_installed("report needs", "matplotlib", "jinja2")
-    from ipsys_log.log.location import file_beside
+    from ipsys_log.app.report.html import render_report
+    from ipsys_log.app.report.robot_run import render_robot_run
+    from ipsys_log.log.dataset import Session
+    from ipsys_log.messages.channels import MEASUREMENTS
+    from ipsys_log.tools.robot_run import has_robot_run
 
     target = html or file_beside(output or logs[-1], ".html")
     check_file(target, "--html", [*logs, *([output] if output else [])])
-    if _report_robots(logs, target):
-        return
-    if _report_recording(logs, target):
-        return
-    from ipsys_log.app.report.html import render_report
-
-    with derive(logs, "evaluate", output, **given) as (session, _, accuracies):
-        write_files(target.parent, {target.name: render_report(session, accuracies).encode()})
-    console.print(f"{target} written: open it in a browser")
-
-
-def _report_recording(logs: Sequence[LogLocation], target: Path) -> bool:
-    """Write the page of a session without calibration points; return False if the logs have some."""
-    from ipsys_log.app.report.files import write_files
-    from ipsys_log.app.report.html import render_report
-    from ipsys_log.log.dataset import Session
-    from ipsys_log.messages.channels import MEASUREMENTS
-
     with Session(logs) as session:
-        if session.topics(MEASUREMENTS):
-            return False
-        page = render_report(session, ())
+        if has_robot_run(session):
+            picture = target.with_suffix(".png")
+            check_file(picture, "--html", logs)
+            page, panels = render_robot_run(session)
+            write_files(target.parent, {target.name: page.encode(), picture.name: panels})
+            console.print(f"{target} and {picture} written")
+            return
+        has_points = bool(session.topics(MEASUREMENTS))
+        page = "" if has_points else render_report(session, ())
+    if has_points:
+        with derive(logs, "evaluate", output, **given) as (session, _, accuracies):
+            page = render_report(session, accuracies)
     write_files(target.parent, {target.name: page.encode()})
     console.print(f"{target} written: open it in a browser")
-    say("the session has no calibration points: the page shows the recording and its runs")
-    return True
-
-
-def _report_robots(logs: Sequence[LogLocation], target: Path) -> bool:
-    """Write the page and the figure of a robot run; return False if the logs have none."""
-    from ipsys_log.app.report.files import check_file, write_files
-    from ipsys_log.app.report.robot_run import render_robot_run
-    from ipsys_log.log.dataset import Session
-    from ipsys_log.tools.robot_run import has_robot_run
-
-    with Session(logs) as session:
-        if not has_robot_run(session):
-            return False
-        picture = target.with_suffix(".png")
-        check_file(picture, "--html", logs)
-        page, panels = render_robot_run(session)
-    write_files(target.parent, {target.name: page.encode(), picture.name: panels})
-    console.print(f"{target} and {picture} written")
-    return True
+    if not has_points:
+        say("the session has no calibration points: the page shows the recording and its runs")
 
 
 _options = options_until("evaluate")
 del _options["as_json"]
-report = build_command("report", _REPORT, {**_options, "html": _HTML}, _report)
+report = with_options({**_options, "html": _HTML}, "report", _REPORT)(_report)
 
 
 def export(
     logs: ReadLogs,
     output: Annotated[
         Path,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="FILE",
-            help="The file to write. Its suffix gives the format: .csv, .parquet (tables), .tum, .kitti "
+        setting(
+            "--output,-o",
+            "FILE",
+            "The file to write. Its suffix gives the format: .csv, .parquet (tables), .tum, .kitti "
             "(trajectories), .mcap (ROS 2 bag), .mp4 (video). For --format coco: a new folder.",
         ),
     ],
     format_: Annotated[
         str | None,
-        typer.Option(
+        setting(
             "--format",
-            metavar="NAME",
-            help="csv, parquet, tum, kitti, ros2, mp4 or coco. Default: by the name of the file.",
+            "NAME",
+            "csv, parquet, tum, kitti, ros2, mp4 or coco. Default: by the name of the file.",
         ),
     ] = None,
     table: Annotated[
         str,
-        typer.Option(
-            metavar="NAME",
-            help="tracks, positions, markers, camera_points, pairs, measurements, events, latency or truth.",
+        setting(
+            "--table",
+            "NAME",
+            "tracks, positions, markers, camera_points, pairs, measurements, events, latency or truth.",
         ),
     ] = "tracks",
     run: Annotated[
         list[str] | None,
-        typer.Option(
-            "--run", metavar="NAME", help="Export this run instead of the newest; repeat it for several."
-        ),
+        setting("--run", "NAME", "Export this run instead of the newest; repeat it for several."),
     ] = None,
-    robot: Annotated[
-        str | None,
-        typer.Option(metavar="NAME", help="Export only this robot."),
-    ] = None,
+    robot: Annotated[str | None, setting("--robot", "NAME", "Export only this robot.")] = None,
     without_images: Annotated[
-        bool, typer.Option("--without-images", help="Leave the images out of a ROS 2 bag.")
+        bool, switch("--without-images", "Leave the images out of a ROS 2 bag.")
     ] = False,
-    frame_rate: Annotated[float, typer.Option(metavar="HZ", help="Frames per second of a video.")] = 25.0,
+    frame_rate: Annotated[float, setting("--frame-rate", "HZ", "Frames per second of a video.")] = 25.0,
     size: Annotated[
-        str, typer.Option(metavar="WIDTHxHEIGHT", help="Size of a video in pixels, two even numbers.")
+        str, setting("--size", "WIDTHxHEIGHT", "Size of a video in pixels, two even numbers.")
     ] = "1280x720",
 ) -> None:
     """Export positions, images or another channel to a file for other programs.
@@ -237,7 +191,6 @@ def export(
     """
     from ipsys_log.api import python_api as api
     from ipsys_log.api.log_export import find_format, parse_size
-    from ipsys_log.app.report.files import check_file
 
     wanted = find_format(output, format_)
     if wanted.suffix is not None:

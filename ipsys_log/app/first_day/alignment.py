@@ -9,7 +9,7 @@ import simplejpeg
 from numpy.typing import NDArray
 
 from ipsys_log.app.report.alignment import read_alignment
-from ipsys_log.app.report.alignment_text import advise, coverage_lines
+from ipsys_log.app.report.camera_poses import advise, coverage_lines
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraCalibration, CompressedImage, Rig
@@ -54,10 +54,6 @@ class AlignmentResult:
 
 def read_result(session: Session, run: str) -> AlignmentResult:
     """Read the alignment from a log of ``ipsys align``.
-
-    Parameters
-    ----------
-    run : the run of its camera points.
 
     Raises
     ------

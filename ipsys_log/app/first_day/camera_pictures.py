@@ -7,9 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ipsys_log.app.first_day.camera_address import ADDRESS_FIELDS, fault_text
 from ipsys_log.app.first_day.camera_choice import (
+    ADDRESS_FIELDS,
     add_camera,
+    fault_text,
     list_attached,
     list_options,
     propose_names,
@@ -81,13 +82,7 @@ class CameraPictures:
         return next(found, None)
 
     def take_all(self, job: Job) -> None:
-        """Search for cameras, and take a picture of each, one after the other.
-
-        Raises
-        ------
-        IpsysError
-            The rig file has a fault.
-        """
+        """Search for cameras, and take a picture of each, one after the other."""
         self._attached = list_attached()
         rig = load_rig(self._rig_file)
         for option in list_options(rig, self._attached):

@@ -6,21 +6,26 @@ import threading
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import chain, count
 from pathlib import Path
 
+import numpy as np
+
 from ipsys_log.app.first_day.alignment import AlignmentResult, read_result
-from ipsys_log.app.first_day.outlier_points import OutlierPoint, find_outlier_points
-from ipsys_log.app.report.accuracy import Accuracy
+from ipsys_log.app.report.accuracy import Accuracy, gather_outliers
 from ipsys_log.app.report.summary import answer_json, answer_text
 from ipsys_log.engine.graph import writes
 from ipsys_log.engine.provenance import newest_run
 from ipsys_log.engine.states import recorded_stages
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.lab_files import tape_sheet_path
+from ipsys_log.live_runs.survey.from_log import exclude
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import LATENCY_TOPIC
+from ipsys_log.log.merged_logs import find_new_ids
+from ipsys_log.messages import LATENCY_TOPIC, Measurement
 from ipsys_log.messages.channels import CAMERA_POINTS, EVALUATION, MEASUREMENTS, TRACKS
 from ipsys_log.statistics.calibration_points import active_measurements
+from ipsys_log.units import CM_PER_M
 
 # The names of logs of an alignment begin with this.
 ALIGNMENT_LOG = "alignment"
@@ -92,19 +97,12 @@ class LabFolder:
 
         Until :meth:`finish_log`, the log does not count: it is being written.
         """
-        number, path = 1, self.path / f"{name}{_SUFFIX}"
-        while path.exists():
-            number += 1
-            path = self.path / f"{name}_{number}{_SUFFIX}"
-        self._writing = path
-        return path
+        self._writing = _unused(self.path / f"{name}{_SUFFIX}")
+        return self._writing
 
     def new_board_folder(self, camera: str) -> Path:
         """Make and return a folder for pictures of a board: ``boards/red``, ``boards/red_2`` and so on."""
-        number, path = 1, self.path / "boards" / camera
-        while path.exists():
-            number += 1
-            path = self.path / "boards" / f"{camera}_{number}"
+        path = _unused(self.path / "boards" / camera)
         path.mkdir(parents=True)
         return path
 
@@ -143,6 +141,12 @@ class LabFolder:
             self._facts = {key: facts for key, facts in self._facts.items() if facts.path != path}
             self._facts[stamp] = _read_facts(path)
         return self._facts[stamp]
+
+
+def _unused(path: Path) -> Path:
+    """Return the path; if it exists, with ``_2``, ``_3`` and so on in its name."""
+    others = (path.with_stem(f"{path.stem}_{number}") for number in count(2))
+    return next(one for one in chain([path], others) if not one.exists())
 
 
 def _stamp(paths: Sequence[Path]) -> _Stamp | None:
@@ -197,3 +201,73 @@ def _sentences(accuracies: Sequence[Accuracy]) -> tuple[str, ...]:
     if answer is None:
         return ()
     return tuple(" ".join(str(line).split()) for line in answer.renderables)
+
+
+_REASON = "it contradicts the fit (setup page)"
+
+
+@dataclass(frozen=True, slots=True)
+class OutlierPoint:
+    """A calibration point that contradicts the fit.
+
+    Attributes
+    ----------
+    log, point : name of its log, and its id in this log.
+    error_cm : distance between the measured position and that of the fit without the point.
+    text : a possible explanation; "" if no simple mistake explains it.
+    """
+
+    log: str
+    point: str
+    error_cm: float
+    text: str
+
+
+def find_outlier_points(paths: Sequence[Path], accuracies: Sequence[Accuracy]) -> tuple[OutlierPoint, ...]:
+    """Return the calibration points that contradict the fit and are not excluded, the worst first."""
+    suspects = [suspect for suspect, _ in gather_outliers(accuracies)]
+    origins = _origins(paths) if suspects else {}
+    return tuple(
+        OutlierPoint(
+            origins[suspect.measurement][0].name,
+            origins[suspect.measurement][1],
+            float(np.linalg.norm(suspect.residual_m)) * CM_PER_M,
+            suspect.text or "",
+        )
+        for suspect in suspects
+        if suspect.measurement in origins
+    )
+
+
+def exclude_outlier(paths: Sequence[Path], log: str, point: str) -> None:
+    """Exclude a calibration point from all stages (``ipsys exclude LOG POINT``); nothing is erased.
+
+    Raises
+    ------
+    IpsysError
+        There is no such log or no such point.
+    """
+    found = next((path for path in paths if path.name == log), None)
+    if found is None:
+        raise IpsysError(f"the folder has no log {log!r} with calibration points; reload this page")
+    exclude(found, [point], _REASON)
+
+
+def _origins(paths: Sequence[Path]) -> dict[str, tuple[Path, str]]:
+    """Return the log of each valid point and its id in it, by the id in the session of all logs."""
+    measured = sorted((found for path in paths if (found := _measured(path))), key=lambda one: one[0])
+    new_ids = find_new_ids([list(payloads) for _, _, payloads in measured])
+    return {
+        ids.get(payload.id, payload.id): (path, payload.id)
+        for (_, path, payloads), ids in zip(measured, new_ids, strict=True)
+        for payload in active_measurements(payloads)
+    }
+
+
+def _measured(path: Path) -> tuple[int, Path, tuple[Measurement, ...]] | None:
+    """Return the time of the first measurement, and all measurements; None without any."""
+    with Session([path]) as session:
+        messages = list(session.messages(session.topics(MEASUREMENTS)))
+    if not messages:
+        return None
+    return messages[0].log_time_ns, path, tuple(message.payload for message in messages)

@@ -10,15 +10,12 @@ from typing import Any, NamedTuple
 from ipsys_log.app.first_day import work
 from ipsys_log.app.first_day.alignment import AlignmentResult
 from ipsys_log.app.first_day.board import BOARD_FIELDS, BoardSearch, parse_board_entry
-from ipsys_log.app.first_day.camera_address import parse_camera_address
-from ipsys_log.app.first_day.camera_choice import save_cameras, set_calibration
+from ipsys_log.app.first_day.camera_choice import parse_camera_address, save_cameras, set_calibration
 from ipsys_log.app.first_day.camera_pictures import CameraPictures
 from ipsys_log.app.first_day.jobs import Job, Jobs
-from ipsys_log.app.first_day.lab_folder import FitFacts, LabFolder
-from ipsys_log.app.first_day.outlier_points import exclude_outlier
+from ipsys_log.app.first_day.lab_folder import FitFacts, LabFolder, exclude_outlier
 from ipsys_log.app.first_day.rig_entry import LABELS, example_rig, rig_fields, rig_warnings, save_rig_entry
 from ipsys_log.app.first_day.steps import SetupProgress, Status, read_progress
-from ipsys_log.app.report.prints import Print, board_print, rig_prints
 from ipsys_log.app.report.rows import cm
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.lab_files import simulated_lab_texts, write_new
@@ -45,7 +42,8 @@ class Pages(NamedTuple):
 class SetupSession:
     """The setup of the lab in a folder. Its state comes from the files of the folder.
 
-    Only pictures of cameras and the present job are in memory.
+    Only pictures of cameras and the present job are in memory. An action raises an IpsysError if a job works,
+    if an earlier step is missing, or if a file or a typed name has a fault.
 
     Parameters
     ----------
@@ -101,34 +99,16 @@ class SetupSession:
         }
 
     def save_rig(self, typed: Mapping[str, str]) -> list[Fault]:
-        """Write the typed rig; return the faults of its fields instead.
-
-        Raises
-        ------
-        IpsysError
-            The rig file cannot be changed, or a job works.
-        """
+        """Write the typed rig; return the faults of its fields instead."""
         self._check_idle()
         return save_rig_entry(self._folder.rig_file, typed)
 
     def simulate(self) -> None:
-        """Write the rig of the simulated lab and its sheet (``ipsys init lab.toml --simulated``).
-
-        Raises
-        ------
-        IpsysError
-            There is a rig file already.
-        """
+        """Write the rig of the simulated lab and its sheet (``ipsys init lab.toml --simulated``)."""
         write_new(simulated_lab_texts(self._folder.rig_file))
 
     def save_cameras(self, names: Mapping[str, str]) -> list[Fault]:
-        """Write the named cameras into the rig file; return the faults of names instead.
-
-        Raises
-        ------
-        IpsysError
-            The rig file has a fault, or a job works.
-        """
+        """Write the named cameras into the rig file; return the faults of names instead."""
         self._check_idle()
         return save_cameras(self._folder.rig_file, names, self._cameras.attached())
 
@@ -136,11 +116,6 @@ class SetupSession:
         """Start to open the camera of a typed address; return the fault of a field instead.
 
         With a picture, the camera is written into the rig file. Without one, the state has the fault.
-
-        Raises
-        ------
-        IpsysError
-            The rig file has a fault, or a job works.
         """
         self._check_idle()
         self._cameras.forget_fault()
@@ -153,13 +128,7 @@ class SetupSession:
         return []
 
     def use_intrinsics(self, camera: str) -> None:
-        """Write the file of intrinsics of a camera into the rig file.
-
-        Raises
-        ------
-        IpsysError
-            The folder has no such file.
-        """
+        """Write the file of intrinsics of a camera into the rig file."""
         self._check_idle()
         files = {one.camera: one.file for one in read_progress(self._folder).intrinsics}
         file = files.get(camera)
@@ -168,13 +137,7 @@ class SetupSession:
         set_calibration(self._folder.rig_file, camera, file)
 
     def calibrate(self, camera: str, typed: Mapping[str, str]) -> list[Fault]:
-        """Start the calibration of a camera with a board; return the fault of a field instead.
-
-        Raises
-        ------
-        IpsysError
-            The rig has no such camera, or a job works.
-        """
+        """Start the calibration of a camera with a board; return the fault of a field instead."""
         self._check_idle()
         step = read_progress(self._folder)
         if camera not in [one.camera for one in step.intrinsics]:
@@ -192,24 +155,12 @@ class SetupSession:
         return []
 
     def exclude(self, log: str, point: str) -> None:
-        """Exclude a calibration point that contradicts the fit.
-
-        Raises
-        ------
-        IpsysError
-            There is no such log or point, or a job works.
-        """
+        """Exclude a calibration point that contradicts the fit."""
         self._check_idle()
         exclude_outlier(self._folder.calibration_logs(), log, point)
 
     def start(self, action: str) -> None:
-        """Start the job of an action.
-
-        Raises
-        ------
-        IpsysError
-            There is no such action, another job works, or the step lacks an earlier one.
-        """
+        """Start the job of an action."""
         if action not in self._actions:
             raise IpsysError(f"the action {action!r} is not known; reload this page")
         title, name, job = self._actions[action]
@@ -228,18 +179,8 @@ class SetupSession:
         return next((one.picture for one in cameras if one.camera == name), None)
 
     def print_pdf(self, name: str, typed: Mapping[str, str]) -> bytes:
-        """Return a print as PDF: ``markers`` of the rig, or the ``board`` of typed fields.
-
-        Raises
-        ------
-        IpsysError
-            There is no such print, or it cannot be drawn.
-        """
-        if name == "markers":
-            return _print_markers(self._folder)
-        if name == "board":
-            return _print_board(typed)
-        raise IpsysError(f"the print {name!r} is not known; reload this page")
+        """Return a print as PDF: ``markers`` of the rig, or the ``board`` of typed fields."""
+        return _print(self._folder, name, typed)
 
     def close(self) -> None:
         """Stop the present job in order."""
@@ -273,16 +214,8 @@ class SetupSession:
             return None
         result = self._alignment = log.alignment
         cameras = [
-            {
-                "camera": one.camera,
-                "level": one.level,
-                "advice": one.advice,
-                "size_px": one.size_px,
-                "centre_px": one.centre_px,
-                "plumb_px": one.plumb_px,
-                "markers_px": one.markers_px,
-                "picture": f"picture/alignment/{one.camera}?{log.start_ns}" if one.picture else None,
-            }
+            asdict(one)
+            | {"picture": f"picture/alignment/{one.camera}?{log.start_ns}" if one.picture else None}
             for one in result.cameras
         ]
         return {"cameras": cameras, "coverage": result.coverage, "notes": result.notes}
@@ -300,37 +233,21 @@ def _describe_fit(fit: FitFacts) -> dict[str, Any]:
     return {"figure": figure, "outliers": [asdict(one) for one in fit.outliers], "answer": list(fit.answer)}
 
 
-def _print_markers(folder: LabFolder) -> bytes:
-    """Return the markers of the rig file as PDF (``ipsys markers --rig lab.toml``).
-
-    Raises
-    ------
-    IpsysError
-        The rig has a fault, or lists no markers. Or Matplotlib is not installed.
-    """
-    rig = load_rig(folder.rig_file)
-    if not rig.all_markers:
-        raise IpsysError("lab.toml lists no markers; type the ids of the robots, and save them")
-    return _draw_pages(rig_prints(rig))
-
-
-def _print_board(typed: Mapping[str, str]) -> bytes:
-    """Return a calibration board as PDF (``ipsys markers --board 6x4``); ``typed`` are texts by field.
-
-    Raises
-    ------
-    IpsysError
-        A field has a fault, or the board is larger than a page. Or Matplotlib is not installed.
-    """
-    entry = parse_board_entry(typed)
-    if isinstance(entry, Fault):
-        raise IpsysError(entry.text)
-    return _draw_pages([board_print(entry.parse(), entry.board)])
-
-
-def _draw_pages(prints: list[Print]) -> bytes:
-    """Return prints as PDF, at true size."""
+def _print(folder: LabFolder, name: str, typed: Mapping[str, str]) -> bytes:
+    """Return the markers of the rig file, or a board of typed fields, as PDF (``ipsys markers``)."""
     check_installed("a print needs", "matplotlib")
-    from ipsys_log.app.report.print_pages import choose_paper, draw_pages, lay_out
+    from ipsys_log.app.report.prints import board_print, choose_paper, draw_pages, lay_out, rig_prints
 
+    if name == "markers":
+        rig = load_rig(folder.rig_file)
+        if not rig.all_markers:
+            raise IpsysError("lab.toml lists no markers; type the ids of the robots, and save them")
+        prints = rig_prints(rig)
+    elif name == "board":
+        entry = parse_board_entry(typed)
+        if isinstance(entry, Fault):
+            raise IpsysError(entry.text)
+        prints = [board_print(entry.parse(), entry.board)]
+    else:
+        raise IpsysError(f"the print {name!r} is not known; reload this page")
     return draw_pages(lay_out(prints, choose_paper(prints, None)))

@@ -1,8 +1,10 @@
-"""The work of the steps with cameras and logs; each does what its command does, without a terminal."""
+"""The work of the steps with cameras and logs; each does what its command does, without a terminal.
+
+An IpsysError says which fault the rig, a camera, a log or a sheet has.
+"""
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
@@ -33,14 +35,9 @@ from ipsys_log.live_runs.survey.entry import check_references
 from ipsys_log.live_runs.survey.from_log import open_finished_log
 from ipsys_log.live_runs.survey.live import LiveScene
 from ipsys_log.live_runs.survey.sheet import add_sheet, check_sheet
-from ipsys_log.messages import (
-    CompressedImage,
-    CompressedVideo,
-    Message,
-    Model,
-)
+from ipsys_log.messages import CompressedImage, CompressedVideo, Message, Model
 from ipsys_log.sinks.sink import Sink
-from ipsys_log.sinks.streams.settings import Stream, check_streams, open_live_streams, settings_of_rig
+from ipsys_log.sinks.streams.opening import Stream, check_streams, open_live_streams, settings_of_rig
 from ipsys_log.units import NS_PER_S
 
 _LAST_STAGE = "camera-frame"
@@ -61,13 +58,7 @@ class LiveRecording:
 
 
 def align(folder: LabFolder, job: Job) -> None:
-    """Record the cameras for some seconds, and compute the camera points of the markers (``ipsys align``).
-
-    Raises
-    ------
-    IpsysError
-        The rig or a camera has a fault.
-    """
+    """Record the cameras for some seconds, and compute the camera points of the markers (``ipsys align``)."""
     with _new_log(folder, ALIGNMENT_LOG) as log:
         _record(folder, job, log, _ALIGN_S)
         if not job.is_stopped():
@@ -79,11 +70,6 @@ def calibrate(folder: LabFolder, search: BoardSearch, pictures: Path, entry: Boa
 
     This is ``ipsys calibrate --rig lab.toml --board BOARD --camera NAME``; it also writes the file into the
     rig. Simulated cameras show the board.
-
-    Raises
-    ------
-    IpsysError
-        The camera has a fault, or the pictures do not determine its intrinsics.
     """
     rig, cameras = load_cameras(folder.rig_file, [search.camera])
     check_sources(cameras)
@@ -92,13 +78,17 @@ def calibrate(folder: LabFolder, search: BoardSearch, pictures: Path, entry: Boa
     with open_lab(Lab(rig, shown, {}, folder.path), job.say) as opened:
         attached = opened.cameras
         job.on_stop(attached.stop)
-        newest = _NewestImage(search.look)
-        with newest:
+        with ThreadPoolExecutor(1, "board") as pool:
+            working: Future[object] = pool.submit(str)
             for message in attached:
-                if message is not None and isinstance(message.payload, (CompressedImage, CompressedVideo)):
-                    newest.put(message.payload)
+                image = None if message is None else message.payload
+                # Images that arrive during a search are left out.
+                if isinstance(image, (CompressedImage, CompressedVideo)) and working.done():
+                    working.result()  # raises the error of the search
+                    working = pool.submit(search.look, image)
                 if search.is_enough:
                     attached.stop()
+        working.result()
     job.say(f"{search.count} pictures are in {pictures.parent.name}/{pictures.name}")
     # A stop ends the search early: the pictures so far count.
     (outcome,) = api.calibrate(
@@ -117,11 +107,6 @@ def measure_sheet(folder: LabFolder, sheet: Path, job: Job) -> None:
     """Record stationary markers, and append the tape measurements of a sheet.
 
     This is ``ipsys record``, and then ``ipsys measure LOG --csv SHEET``.
-
-    Raises
-    ------
-    IpsysError
-        The rig, a camera or a row of the sheet has a fault.
     """
     with _new_log(folder, "calibration") as log:
         _record(folder, job, log, _SHEET_S)
@@ -139,11 +124,6 @@ def measure(folder: LabFolder, show: Callable[[LiveScene], AbstractContextManage
     Parameters
     ----------
     show : shows the measuring page of a scene.
-
-    Raises
-    ------
-    IpsysError
-        The rig or a camera has a fault, or the rig has fewer than two reference points.
     """
     with _new_log(folder, "calibration") as log, _open_cameras(folder, job) as (opened, monitor):
         check_references(opened.rig)
@@ -158,11 +138,6 @@ def fit_and_evaluate(folder: LabFolder, job: Job) -> None:
     """Fit the model to all calibration points of the folder, and evaluate it (``ipsys replay``).
 
     A stop keeps the finished runs; the logs get no part of a run.
-
-    Raises
-    ------
-    IpsysError
-        No log has calibration points, or the points do not determine the model.
     """
     api.replay(*folder.calibration_logs(), progress=job.progress, say=job.say)
 
@@ -173,11 +148,6 @@ def track(folder: LabFolder, show: Callable[[LiveRecording], AbstractContextMana
     Parameters
     ----------
     show : shows the dashboard of a recording; its value gets the recorded messages.
-
-    Raises
-    ------
-    IpsysError
-        The rig, a camera or the model has a fault.
     """
     request = Request(model_from=folder.calibration_logs()[-1])
     with _new_log(folder, "live") as log, _open_cameras(folder, job) as (opened, monitor):
@@ -224,50 +194,6 @@ def _record(folder: LabFolder, job: Job, log: Path, seconds: float) -> None:
         job.say(f"the cameras are open; {log.name} gets {seconds:g} s")
         enough = _Enough(opened.cameras, seconds, job)
         pipeline.record(opened.cameras, opened.settings, log, [enough])
-
-
-class _NewestImage:
-    """A context manager with a thread that handles the newest image, and leaves out those before it."""
-
-    def __init__(self, handle: Callable[[CompressedImage | CompressedVideo], None]) -> None:
-        self._handle = handle
-        self._image: CompressedImage | CompressedVideo | None = None
-        self._changed = threading.Condition()
-        self._is_ended = False
-        self._pool = ThreadPoolExecutor(1, "board")
-        self._working: Future[None] | None = None
-
-    def __enter__(self) -> None:
-        self._working = self._pool.submit(self._work)
-
-    def __exit__(self, *_: object) -> None:
-        with self._changed:
-            self._is_ended = True
-            self._changed.notify_all()
-        self._pool.shutdown()
-        self._raise()
-
-    def put(self, image: CompressedImage | CompressedVideo) -> None:
-        """Replace the waiting image; raise the error of the thread."""
-        if self._working is not None and self._working.done():
-            self._raise()
-        with self._changed:
-            self._image = image
-            self._changed.notify_all()
-
-    def _raise(self) -> None:
-        if self._working is not None:
-            self._working.result()
-
-    def _work(self) -> None:
-        while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._image is not None or self._is_ended)
-                image, self._image = self._image, None
-                if self._is_ended:
-                    return
-            assert image is not None
-            self._handle(image)
 
 
 class _Enough:

@@ -258,10 +258,7 @@ def _sentences(
     if by_places:
         yield f"{use} {_by_number(by_places)}."
     most = max(choices)
-    for other, start in (
-        (ALL_MODELS, "Model"),
-        (HEIGHT_KNOWN, "With known marker heights, model"),
-    ):
+    for other, start in ((ALL_MODELS, "Model"), (HEIGHT_KNOWN, "With known marker heights, model")):
         if SIMPLE in choices[most] and other in choices[most]:
             yield from _saving(start, choices[most][other].model, choices[most][SIMPLE], most, table)
 

@@ -59,13 +59,7 @@ def batch_json(results: Sequence[LogResult]) -> dict[str, Any]:
 
 
 def write_results(path: Path, results: Sequence[LogResult]) -> None:
-    """Write a Parquet file with a row for each log.
-
-    Raises
-    ------
-    IpsysError
-        PyArrow is not installed.
-    """
+    """Write a Parquet file with a row for each log."""
     columns = {
         "log": "string",
         "state": "string",

@@ -1,13 +1,11 @@
-"""Live cameras, latencies and comparisons as tables for a terminal and for JSON."""
+"""Live cameras, robots and the recording as tables for a terminal."""
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
+from collections.abc import Callable, Mapping
 from math import degrees
 from pathlib import Path
-from typing import Any
 
 from rich.console import Group
 from rich.text import Text
@@ -17,11 +15,8 @@ from ipsys_log.capture.disk import DiskRoom
 from ipsys_log.capture.frames import CameraState
 from ipsys_log.capture.live_check import CameraMonitor, FrameCheck
 from ipsys_log.messages import CompressedImage, CompressedVideo, Markers, Message, Track, Tracks
-from ipsys_log.plain_text import plain_text
 from ipsys_log.statistics.disagreement import OverlapSummary
-from ipsys_log.statistics.latency import Percentiles
-from ipsys_log.tools.differences import Comparison
-from ipsys_log.units import CM_PER_M, NS_PER_S, format_bytes, format_duration
+from ipsys_log.units import NS_PER_S, format_bytes, format_duration
 
 # After this time, the measured growth of a log is better than the estimate.
 _SETTLED_S = 5.0
@@ -204,55 +199,3 @@ def _markers(check: FrameCheck) -> Text:
     ]
     more = [Text(f"and {len(ids) - _MOST_IDS} more")] if len(ids) > _MOST_IDS else []
     return Text(", ").join([*ids[:_MOST_IDS], *more]) if ids else Text("none")
-
-
-def latency_table(steps: Mapping[str, Percentiles]) -> Rows:
-    """Return a table of the durations of the steps, in ms."""
-    columns = ("step", ">median", ">90 %", ">99 %", ">longest")
-    cells = [[step, *map(ms, asdict(percentiles).values())] for step, percentiles in steps.items()]
-    note = "total: from the arrival of a frame to its position"
-    return Rows("Duration of each step in ms", columns, cells, note)
-
-
-def comparison_table(found: Sequence[Comparison], sides: tuple[str, str]) -> Rows:
-    """Return a table with one row per channel; ``sides`` are the headings of the two compared sides."""
-    cells: list[list[str | Text]] = []
-    for one in found:
-        topic = Text(plain_text(one.topic.removeprefix("/runs/")), style="" if one.equal else "red")
-        distances = (_distance(value, one.unit) for value in (one.rms, one.greatest))
-        cells.append([topic, str(one.left), str(one.right), _same_text(one), *distances])
-    columns = ("channel", *(f">{side}" for side in sides), ">same", ">RMS diff", ">max diff")
-    return Rows("", columns, cells)
-
-
-def _same_text(comparison: Comparison) -> str:
-    if not comparison.equal:
-        return str(comparison.same)
-    return "all" if comparison.repeated else "as written"
-
-
-def first_difference(found: Sequence[Comparison]) -> str | None:
-    """Return the first difference of two sides as text; None if they are equal."""
-    different = [comparison for comparison in found if not comparison.equal]
-    if not different:
-        return None
-    if not any(comparison.together for comparison in found if comparison.left > 1):
-        return "the two sides have no frame in common: no two messages have the same time"
-    first = min(different, key=lambda one: one.first_ns or 0)
-    return f"first difference in {first.topic}: {first.first}"
-
-
-def _distance(value: float | None, unit: str | None) -> str:
-    if value is None:
-        return ""
-    if value == 0:
-        return "0"
-    return f"{value:.2g} px" if unit == "px" else f"{value * CM_PER_M:.2g} cm"
-
-
-def comparison_json(found: Sequence[Comparison]) -> dict[str, Any]:
-    """Return the comparison as plain data: whether all channels are equal, and each channel."""
-    return {
-        "equal": all(comparison.equal for comparison in found),
-        "channels": [asdict(comparison) for comparison in found],
-    }

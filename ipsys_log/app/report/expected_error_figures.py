@@ -16,6 +16,7 @@ from matplotlib.ticker import MaxNLocator
 from scipy.ndimage import gaussian_filter
 
 from ipsys_log.app.report.figures import add_panel, has_legend, legend_label, name_cameras, save_figure
+from ipsys_log.app.report.floor_figure import draw_references
 from ipsys_log.app.report.rows import means_cm
 from ipsys_log.app.report.styles import NOTE, REST, camera_styles, shorten
 from ipsys_log.live_runs.survey.floor_plan import PlannedFloor, mesh
@@ -84,14 +85,8 @@ def draw_lab(lab: LabCalibration, path: Path) -> None:
     title += f"for markers {lab.height_m * 100:.0f} cm above it"
     figure.text(_LEFT_IN / width_in, 1 - 0.28 / height_in, title, fontsize=12)
     handles, labels = axes.get_legend_handles_labels()
-    figure.legend(
-        handles,
-        labels,
-        loc=((_LEFT_IN - 0.15) / width_in, 0.08 / height_in),
-        ncols=5,
-        fontsize=9,
-        frameon=False,
-    )
+    location = ((_LEFT_IN - 0.15) / width_in, 0.08 / height_in)
+    figure.legend(handles, labels, loc=location, ncols=5, fontsize=9, frameon=False)
     save_figure(figure, path)
 
 
@@ -112,26 +107,16 @@ def _draw_camera(
     axes.plot(*camera.places_m.T, ".", color=NOTE, ms=1.5, zorder=3)
     axes.plot([], [], ".", color=NOTE, ms=5, label="a marker was here")
     axes.plot(
-        *lab.points_m.T,
-        "o",
-        mfc="black",
-        mec="white",
-        ms=point_pt,
-        mew=point_pt / 6,
-        zorder=4,
+        *lab.points_m.T, "o", mfc="black", mec="white", ms=point_pt, mew=point_pt / 6, zorder=4,
         label="calibration point",
-    )
+    )  # fmt: skip
     if lab.points:
         _draw_points(axes, lab, camera)
     if lab.gap is not None and not lab.is_enough and lab.gap.camera == camera.camera:
         x_m, y_m = lab.gap.low_m - half_m
         size_m = lab.gap.high_m - lab.gap.low_m + 2 * half_m
         axes.add_patch(Rectangle((x_m, y_m), *size_m, fill=False, ec="#D55E00", lw=1.8, ls="--", zorder=4))
-    for point in lab.rig.reference_points:
-        axes.plot(point.x_m, point.y_m, "+", color="black", ms=10, mew=1.6, zorder=4)
-        axes.annotate(
-            point.name, (point.x_m, point.y_m), (5, 5), textcoords="offset points", weight="bold", zorder=6
-        )
+    draw_references(axes, lab.rig.reference_points)
     mean, covered = f"{camera.mean_m * MM_PER_M:.1f}", f"{camera.covered:.0%}"
     axes.set_title(f"{shorten(camera.camera)}: {mean} mm, {covered} covered", loc="left", fontsize=11)
     axes.set(xlim=(x0 - half_m, x1 + half_m), ylim=(y0 - half_m, y1 + half_m), xlabel="x in m")
@@ -148,15 +133,9 @@ def _draw_points(axes: Axes, lab: LabCalibration, camera: CameraResult) -> None:
         axes.plot([], [], "s", ms=9, mfc="none", mec="#D55E00", label="to drive through")
     for number, point in enumerate(lab.points, 1):
         if camera.camera in point.cameras:
-            axes.plot(*point.point_m, "o", ms=14, mfc="white", mec="black", mew=1.3, zorder=5)
-            axes.annotate(
-                str(number),
-                (point.point_m[0], point.point_m[1]),
-                ha="center",
-                va="center",
-                fontsize=9,
-                zorder=6,
-            )
+            x_m, y_m = point.point_m
+            axes.plot(x_m, y_m, "o", ms=14, mfc="white", mec="black", mew=1.3, zorder=5)
+            axes.annotate(str(number), (x_m, y_m), ha="center", va="center", fontsize=9, zorder=6)
 
 
 _SIDE_IN = 5.35

@@ -203,11 +203,11 @@ def _calibrated(
     session: Session, accuracies: Sequence[Accuracy], models: Mapping[str, Model | None]
 ) -> tuple[CalibratedCamera, ...]:
     """Return the cameras of the joint model among the evaluated models."""
-    run, model = next(
-        ((one.run, models[one.model]) for one in accuracies if _is_joint(one.model)), ("", None)
-    )
+    joint = [one for one in accuracies if is_known(one.model) and reads_corners(one.model)]
+    model = models[joint[0].model] if joint else None
     if model is None:
         return ()
+    run = joint[0].run
     # Late: scipy takes 1 s, and most reports have no joint model.
     from ipsys_log.statistics.calibrated_cameras import describe_cameras
     from ipsys_log.statistics.joint_evaluation import fit_without, observe
@@ -223,10 +223,6 @@ def _calibrated(
             fit = fit_without(observe(view), {one.id for one in measurements} - used)
     sizes_px = {camera: (lens.width, lens.height) for camera, lens in view.calibrations().items()}
     return describe_cameras(model, sizes_px, fit)
-
-
-def _is_joint(model: str) -> bool:
-    return is_known(model) and reads_corners(model)
 
 
 def _model(session: Session, run: str) -> Model | None:

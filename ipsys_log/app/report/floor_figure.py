@@ -24,13 +24,7 @@ from ipsys_log.app.report.styles import GRID, REST, camera_styles, robot_colour,
 from ipsys_log.engine.provenance import newest_run
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import (
-    TRUTH_TOPIC,
-    CameraEvaluation,
-    Evaluation,
-    ReferencePoint,
-    Rig,
-)
+from ipsys_log.messages import TRUTH_TOPIC, CameraEvaluation, Evaluation, ReferencePoint, Rig
 from ipsys_log.messages.channels import MEASUREMENTS, TRACKS, TRUTH
 from ipsys_log.sinks.selection import rig_in_force
 from ipsys_log.statistics.accuracy import CROSS_VALIDATION
@@ -71,12 +65,7 @@ class FloorData:
 
 
 def draw_floor(axes: Axes, scene: FloorData, styles: Mapping[str, tuple[str, str]]) -> None:
-    """Draw the floor, tracks, points and errors of a scene.
-
-    Parameters
-    ----------
-    styles : colour and marker shape by camera.
-    """
+    """Draw the floor, tracks, points and errors of a scene."""
     around_m = [place.point_m[:2] for place in scene.places]
     if not around_m and not (scene.rig and scene.rig.floor):
         lines = (*scene.tracks.values(), *scene.truth.values())
@@ -108,7 +97,7 @@ def draw_ground(axes: Axes, rig: Rig | None, around_m: Sequence[NDArray[np.float
     axes.yaxis.set_major_locator(_steps(square.half))
     axes.grid(color=GRID, lw=0.7)
     axes.set_axisbelow(True)
-    _draw_references(axes, rig.reference_points if rig else ())
+    draw_references(axes, rig.reference_points if rig else ())
 
 
 class Square(NamedTuple):
@@ -137,7 +126,8 @@ def show_square(axes: Axes, square: Square) -> None:
     axes.set(xlim=(x - half, x + half), ylim=(y - half, y + half))
 
 
-def _draw_references(axes: Axes, points: Sequence[ReferencePoint]) -> None:
+def draw_references(axes: Axes, points: Sequence[ReferencePoint]) -> None:
+    """Draw the reference points with their names."""
     for point in points:
         axes.plot(point.x_m, point.y_m, "+", color="black", ms=11, mew=1.6, zorder=5)
         axes.annotate(
@@ -257,13 +247,7 @@ def draw_session(session: Session, accuracies: Sequence[Accuracy], path: Path) -
 
     The left side shows the floor to scale: measured points, tracks and, if known, the ground truth. An arrow
     shows the error of the first model at each held-out point. The title states the factor of the arrows. The
-    right side shows every error of every model and camera, in cm.
-
-    Parameters
-    ----------
-    session : open logs.
-    accuracies : from :func:`ipsys_log.app.report.accuracy.read_accuracy`; empty leaves out the right side.
-    path : path of the figure; an existing file is replaced. The suffix gives the file format.
+    right side shows every error of every model and camera, in cm; it exists only with accuracies.
 
     Raises
     ------

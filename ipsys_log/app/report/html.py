@@ -11,12 +11,12 @@ from matplotlib.axes import Axes
 
 from ipsys_log.app.report import html_figures, html_sections
 from ipsys_log.app.report.accuracy import Accuracy, read_trajectories
-from ipsys_log.app.report.cameras import latency_table
 from ipsys_log.app.report.contents import runs_table, states_json
 from ipsys_log.app.report.figures import MOST_IN_LEGEND, new_figure, style_axes
 from ipsys_log.app.report.findings import Findings, gather_findings
 from ipsys_log.app.report.html_figures import picture
 from ipsys_log.app.report.latency_figure import draw_shares, draw_steps
+from ipsys_log.app.report.log_texts import latency_table
 from ipsys_log.app.report.rows import Rows
 from ipsys_log.app.report.styles import camera_styles, shorten
 from ipsys_log.app.report.tables import advice_table, height_note, suspects_table, trajectory_table
@@ -45,11 +45,6 @@ _MS_PER_S = 1e3
 
 def render_report(session: Session, accuracies: Sequence[Accuracy]) -> str:
     """Render the page of a session; the same log always gives the same page.
-
-    Parameters
-    ----------
-    session : open logs.
-    accuracies : from :func:`ipsys_log.app.report.accuracy.read_accuracy`.
 
     Raises
     ------
@@ -159,14 +154,11 @@ def _overlap(session: Session, findings: Findings) -> dict[str, Any]:
 def _tracks(session: Session) -> dict[str, Any]:
     """Return the picture of the newest tracks, and their errors if there is ground truth."""
     run = newest_run(session, TRACKS)
+    tracks = [] if run is None else [Accuracy(run, None, None, tuple(read_trajectories(session, run)))]
     return {
         "tracks_picture": html_figures.tracks_picture(session, run),
-        "trajectories": None if run is None else trajectory_table([_with_trajectories(session, run)]),
+        "trajectories": trajectory_table(tracks),
     }
-
-
-def _with_trajectories(session: Session, run: str) -> Accuracy:
-    return Accuracy(run, None, None, tuple(read_trajectories(session, run)))
 
 
 def _commands(session: Session, findings: Findings) -> dict[str, str]:

@@ -19,10 +19,10 @@ from ipsys_log.app.report.calibration_figures import (
     residual_limit_px,
     residuals_figure,
 )
+from ipsys_log.app.report.drive_figures import draw_tracks, read_drawn_tracks
 from ipsys_log.app.report.figures import PAGE_IN, add_bar, has_legend, new_figure, style_axes, svg_data_uri
 from ipsys_log.app.report.findings import Findings
 from ipsys_log.app.report.floor_figure import draw_ground
-from ipsys_log.app.report.learning_figure import Curves, camera_curves, curves_picture, limits_cm, mean_curves
 from ipsys_log.app.report.paper_figures import (
     HELD_OUT,
     draw_models,
@@ -30,10 +30,16 @@ from ipsys_log.app.report.paper_figures import (
     residual_scale,
     shown_models,
 )
-from ipsys_log.app.report.points_figure import draw_coverage
+from ipsys_log.app.report.points_figures import (
+    Curves,
+    camera_curves,
+    curves_picture,
+    draw_coverage,
+    limits_cm,
+    mean_curves,
+)
 from ipsys_log.app.report.styles import robot_colour, shorten
 from ipsys_log.app.report.tables import height_note
-from ipsys_log.app.report.tracks_figure import draw_tracks, read_drawn_tracks
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Rig
 from ipsys_log.statistics.disagreement import PairDisagreement, divide_floor, divide_time
@@ -85,8 +91,8 @@ def residual_pictures(findings: Findings) -> list[Picture]:
     accuracies = shown_models(findings)
     if not accuracies:
         return []
-    pictures = []
-    scale = residual_scale(findings, accuracies)
+    pictures, scale = [], residual_scale(findings, accuracies)
+    hull = "Dashed" if has_legend(len(findings.training_m())) else "Grey line"
     for accuracy in accuracies:
         figure, axes = new_figure(5.6)
         arrows = draw_residuals(axes, findings, accuracy, scale)
@@ -94,14 +100,10 @@ def residual_pictures(findings: Findings) -> list[Picture]:
         caption = (
             f"Errors of {label(accuracy.model)}, seen from above. An arrow points from the calibration "
             "point to the estimated position; arrows are enlarged. "
-            f"{_hull_text(findings)}: area of the calibration points of a camera"
+            f"{hull}: area of the calibration points of a camera"
         )
         pictures.append(picture(figure, caption))
     return pictures
-
-
-def _hull_text(findings: Findings) -> str:
-    return "Dashed" if has_legend(len(findings.training_m())) else "Grey line"
 
 
 def learning_pictures(findings: Findings) -> list[Picture]:

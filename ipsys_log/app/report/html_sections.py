@@ -13,7 +13,7 @@ from ipsys_log.app.report.accuracy import Accuracy
 from ipsys_log.app.report.advice import label, uses_height
 from ipsys_log.app.report.figures import has_legend
 from ipsys_log.app.report.findings import Findings, overall_row, overall_row_with_excluded
-from ipsys_log.app.report.points_figure import hull_m
+from ipsys_log.app.report.points_figures import hull_m
 from ipsys_log.app.report.rows import Rows, cm, mm, percent
 from ipsys_log.messages import CameraEvaluation, ErrorStatistics
 from ipsys_log.statistics.accuracy import POOLED

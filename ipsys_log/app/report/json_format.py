@@ -70,13 +70,7 @@ def document(result: Any) -> dict[str, Any]:
 
 
 def old_document(result: Any, command: str | None) -> Any:
-    """Return the result of a command with the keys of format 1.
-
-    Parameters
-    ----------
-    result : the result in SI units.
-    command : name of the command.
-    """
+    """Return the result of a command, which is in SI units, with the keys of format 1."""
     is_evaluation = isinstance(result, dict) and "stages" in result
     old = _OLD_KEYS.get(None if is_evaluation else command, ())
     return _renamed(result, dict(map(_today, old)))

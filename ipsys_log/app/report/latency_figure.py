@@ -23,11 +23,6 @@ def draw_latency(times_s: Mapping[str, NDArray[np.float64]], path: Path) -> None
     """Draw the cumulative distribution of the latency, and the duration of each step.
 
     A file in pixels has 1200 x 600 pixels.
-
-    Parameters
-    ----------
-    times_s : from :func:`ipsys_log.statistics.latency.step_times_s`.
-    path : path of the figure; the suffix gives the file format.
     """
     figure = Figure(figsize=(12, 6), dpi=100)
     left = figure.add_axes((0.07, 0.11, 0.42, 0.73))

@@ -1,4 +1,4 @@
-"""Messages, channel sizes and findings of a check of a log, as text and as plain data.
+"""Messages, channel sizes and latencies of a log, as text and as plain data.
 
 Long parts and bytes of a message are given by their size.
 """
@@ -6,23 +6,22 @@ Long parts and bytes of a message are given by their size.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
 from ipsys_log.app.report.json_format import FORMAT, plain
-from ipsys_log.app.report.rows import Rows, counted, percent
+from ipsys_log.app.report.rows import Rows, ms, percent
 from ipsys_log.errors import LogError
 from ipsys_log.log.channel_sizes import ChannelSize
 from ipsys_log.log.contents import RawMessage, StoredChannel
 from ipsys_log.messages import Message
 from ipsys_log.plain_text import plain_text
-from ipsys_log.tools.soundness.finding import BROKEN, SOUND, UNREAD, LogCheck, LogFinding
+from ipsys_log.statistics.latency import Percentiles
 from ipsys_log.units import format_bytes, format_time
 
 _LONGEST_VALUE = 200
 _TIME = "timestamp"  # every payload repeats its publish time
-_MOST_LINES = 30
 
 
 def message_line(raw: RawMessage, message: Message | LogError, channel: StoredChannel) -> str:
@@ -54,16 +53,7 @@ def sizes_json(path: str, file_bytes: int, sizes: Sequence[ChannelSize]) -> dict
     return {
         "path": path,
         "bytes": file_bytes,
-        "channels": [
-            {
-                "topic": size.topic,
-                "messages": size.messages,
-                "payload_bytes": size.payload_bytes,
-                "stored_bytes": size.stored_bytes,
-                "share": size.stored_bytes / file_bytes,
-            }
-            for size in sizes
-        ],
+        "channels": [{**asdict(size), "share": size.stored_bytes / file_bytes} for size in sizes],
         "other_bytes": file_bytes - stored_bytes,
     }
 
@@ -81,34 +71,6 @@ def sizes_table(sizes: dict[str, Any]) -> Rows:
     cells.append(["(definitions, indexes)", "", "", other, percent(share, 1)])
     columns = ("topic", ">messages", ">payload", ">in the file", ">share")
     return Rows(f"{sizes['path']}, {format_bytes(sizes['bytes'])}", columns, cells)
-
-
-def check_json(checks: Sequence[LogCheck]) -> dict[str, Any]:
-    """Return the results as plain data; notes are included, and missing values are left out."""
-    return {
-        "state": LogCheck.worst(checks),
-        "logs": [
-            {
-                "path": str(check.path),
-                "state": check.state,
-                "findings": [_finding_json(finding) for finding in check.findings],
-            }
-            for check in checks
-        ],
-    }
-
-
-def check_lines(check: LogCheck, details: bool = False) -> Iterator[str]:
-    """Yield the answer for a log, then a line for each finding; notes only with ``details``."""
-    findings = check.findings if details else check.remarks
-    yield f"{check.path}: {_answer(check)}"
-    for finding in findings[:_MOST_LINES]:
-        if finding is not _first_fault(check):
-            yield f"  {_finding_line(finding)}"
-        elif finding.advice:
-            yield f"  {finding.advice}"
-    if len(findings) > _MOST_LINES:
-        yield f"  and {len(findings) - _MOST_LINES} more: --json lists all"
 
 
 def _data(raw: RawMessage, message: Message | LogError, channel: StoredChannel) -> dict[str, Any]:
@@ -139,27 +101,9 @@ def _short(key: str, value: Any) -> str:
     return f"{key}={text[:_LONGEST_VALUE]}"
 
 
-def _finding_json(finding: LogFinding) -> dict[str, Any]:
-    return {key: value for key, value in asdict(finding).items() if value not in (None, "")}
-
-
-def _first_fault(check: LogCheck) -> LogFinding | None:
-    return next((finding for finding in check.findings if finding.level in (BROKEN, UNREAD)), None)
-
-
-def _answer(check: LogCheck) -> str:
-    fault = _first_fault(check)
-    if fault is not None:
-        return f"{check.state}: {plain_text(fault.text)}"
-    number = len(check.remarks)
-    return SOUND if not number else f"readable, {counted(number, 'remark')}"
-
-
-def _finding_line(finding: LogFinding) -> str:
-    """Return the place, the fault and the advice of a finding in one line."""
-    place = [finding.topic] if finding.topic else []
-    place += [f"at {format_time(finding.time_ns)}"] if finding.time_ns is not None else []
-    place += [f"({finding.count} messages)"] if finding.count is not None and finding.count > 1 else []
-    title = f"{' '.join(place)}: " if place else ""
-    advice = f"; {finding.advice}" if finding.advice else ""
-    return plain_text(f"{title}{finding.text}{advice}")
+def latency_table(steps: Mapping[str, Percentiles]) -> Rows:
+    """Return a table of the durations of the steps, in ms."""
+    columns = ("step", ">median", ">90 %", ">99 %", ">longest")
+    cells = [[step, *map(ms, asdict(percentiles).values())] for step, percentiles in steps.items()]
+    note = "total: from the arrival of a frame to its position"
+    return Rows("Duration of each step in ms", columns, cells, note)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import csv
+import io
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,8 +19,8 @@ from ipsys_log.app.report import calibration_figures
 from ipsys_log.app.report.accuracy import Accuracy
 from ipsys_log.app.report.advice import has_published, label
 from ipsys_log.app.report.figures import ERROR_COLOURS, png, scale_logarithmic, style_axes
-from ipsys_log.app.report.files import cross_validation_csv, paper_csv, write_files
-from ipsys_log.app.report.findings import Findings, PointErrors, errors_in, overall_row
+from ipsys_log.app.report.files import write_files
+from ipsys_log.app.report.findings import Findings, errors_in, overall_row
 from ipsys_log.app.report.floor_figure import (
     Square,
     arrow_factor,
@@ -28,8 +30,13 @@ from ipsys_log.app.report.floor_figure import (
     show_square,
     square_around,
 )
-from ipsys_log.app.report.learning_figure import learning_figure, mean_curves, published_figure
-from ipsys_log.app.report.points_figure import draw_hulls, places_figure
+from ipsys_log.app.report.points_figures import (
+    draw_hulls,
+    learning_figure,
+    mean_curves,
+    places_figure,
+    published_figure,
+)
 from ipsys_log.app.report.styles import NOTE, model_styles
 from ipsys_log.app.report.tables import height_note
 from ipsys_log.errors import IpsysError
@@ -64,10 +71,7 @@ def shown_models(findings: Findings) -> list[Accuracy]:
 
 def residual_scale(findings: Findings, accuracies: Sequence[Accuracy]) -> ResidualScale:
     """Return one scale for the maps of all these models, so that the maps can be compared by eye."""
-    missed = [missed for accuracy in accuracies for missed in findings.point_errors(accuracy)]
-    places_m = np.vstack([camera_errors.world_m[:, :2] for camera_errors in missed])
-    errors_m = np.vstack([camera_errors.offsets_m[:, :2] for camera_errors in missed])
-    lengths_cm = np.concatenate([_lengths_cm(findings, camera_errors) for camera_errors in missed])
+    places_m, errors_m, lengths_cm = _point_errors(findings, accuracies)
     square = square_around(findings.rig, [places_m])
     factor = arrow_factor(list(errors_m), 2 * square.half)
     # Make room for the arrows, while the floor stays large.
@@ -97,10 +101,7 @@ def residuals_figure(findings: Findings) -> Figure:
 
 def draw_residuals(axes: Axes, findings: Findings, accuracy: Accuracy, scale: ResidualScale) -> Quiver:
     """Draw one model's mean error at each point as an arrow on the floor, coloured by its length in space."""
-    missed = findings.point_errors(accuracy)
-    places_m = np.vstack([camera_errors.world_m[:, :2] for camera_errors in missed])
-    errors_m = np.vstack([camera_errors.offsets_m[:, :2] for camera_errors in missed])
-    lengths_cm = np.concatenate([_lengths_cm(findings, camera_errors) for camera_errors in missed])
+    places_m, errors_m, lengths_cm = _point_errors(findings, [accuracy])
     draw_ground(axes, findings.rig, [places_m])
     draw_hulls(axes, findings)
     show_square(axes, scale.square)
@@ -119,8 +120,13 @@ def draw_residuals(axes: Axes, findings: Findings, accuracy: Accuracy, scale: Re
     return arrows
 
 
-def _lengths_cm(findings: Findings, missed: PointErrors) -> Array:
-    return missed.lengths_m[:, 0 if findings.in_space else 1] * CM_PER_M
+def _point_errors(findings: Findings, accuracies: Sequence[Accuracy]) -> tuple[Array, Array, Array]:
+    """Return points and errors on the floor (n, 2) in m, and lengths (n,) in cm, of models in all cameras."""
+    errors = [one for accuracy in accuracies for one in findings.point_errors(accuracy)]
+    places_m = np.vstack([one.world_m[:, :2] for one in errors])
+    offsets_m = np.vstack([one.offsets_m[:, :2] for one in errors])
+    lengths_m = np.concatenate([one.lengths_m[:, 0 if findings.in_space else 1] for one in errors])
+    return places_m, offsets_m, lengths_m * CM_PER_M
 
 
 _LOG_RATIO = 10.0
@@ -179,6 +185,68 @@ def _ends_cm(errors: ErrorStatistics) -> list[float]:
     """Return the ends of the confidence interval of the mean, or the mean itself, in cm."""
     ends_m = (errors.mean_low_m, errors.mean_high_m)
     return [(errors.mean_m if end_m is None else end_m) * CM_PER_M for end_m in ends_m]
+
+
+# Names of the methods in Tables I and II of the paper.
+_PAPER_NAMES = {
+    "rigid": "RT",
+    "poly": "PR",
+    "rigid+poly": "RT + PR",
+    "ann": "ANN",
+    "rigid+ann": "RT + ANN",
+    "kriging": "KI",
+    "rigid+kriging": "RT + KI",
+    "kriging-regression": "KR",
+    "rigid+kriging-regression": "RT + KR",
+}
+_FIGURES = ("mean", "min", "max", "std")
+
+
+def paper_csv(findings: Findings, in_space: bool) -> bytes:
+    """Return Table I of the paper (errors in space) or Table II (errors on the floor), one row per model.
+
+    The columns are those of the paper: the means of the cameras, then their minima, maxima and standard
+    deviations. The errors are on held-out points, against the tape. Unknown values are empty.
+    """
+    header = ["method", "paper"] + [f"{figure}_cm_{c}" for figure in _FIGURES for c in findings.cameras]
+    rows = []
+    for accuracy in findings.accuracies:
+        by_camera = {row.camera: row for row in accuracy.rows(False) if row.against == "tape"}
+        errors = [errors_in(by_camera.get(camera), in_space) for camera in findings.cameras]
+        cells = [_cm(getattr(e, f"{name}_m") if e else None) for name in _FIGURES for e in errors]
+        rows.append([accuracy.model, _PAPER_NAMES.get(accuracy.model, ""), *cells])
+    return _csv(header, rows)
+
+
+_STATISTICS = ("mean", "mean_low", "mean_high", "min", "median", "p95", "max", "std")
+
+
+def cross_validation_csv(findings: Findings) -> bytes:
+    """Return a table with one row per model, camera (``all``: all together) and reference (tape or truth)."""
+    header = ["method", "camera", "against", "places"]
+    header += [f"{name}_{space}_cm" for space in ("3d", "2d") for name in (*_STATISTICS, "rmse")]
+    header += [f"bias_{axis}_cm" for axis in "xyz"] + ["within_68", "within_95"]
+    rows = []
+    for accuracy in findings.accuracies:
+        for row in accuracy.rows(True):
+            cells = [accuracy.model, row.camera or "all", row.against, str(row.error_2d.count)]
+            for errors in (row.error_3d, row.error_2d):
+                cells += [_cm(getattr(errors, f"{name}_m") if errors else None) for name in _STATISTICS]
+                cells.append(_cm(accuracy.errors_of(row).rmse_m(errors)))
+            cells += map(_cm, [None] * 3 if row.bias_m is None else row.bias_m.tolist())
+            cells += ["" if v is None else f"{v:.4f}" for v in (row.within_68, row.within_95)]
+            rows.append(cells)
+    return _csv(header, rows)
+
+
+def _cm(value_m: float | None) -> str:
+    return "" if value_m is None else f"{value_m * CM_PER_M:.3f}"
+
+
+def _csv(header: Sequence[str], rows: Iterable[Sequence[str]]) -> bytes:
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([header, *rows])
+    return text.getvalue().encode()
 
 
 # For each file: the condition to write it, and the function that returns its bytes.

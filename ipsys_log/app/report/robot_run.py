@@ -116,9 +116,9 @@ def render_robot_run(session: Session) -> tuple[str, bytes]:
     IpsysError
         The log has no robot run.
     """
+    from ipsys_log.app.report.drive_figures import draw_drive, draw_panels, draw_paths
     from ipsys_log.app.report.figures import png, svg_data_uri
     from ipsys_log.app.report.html import render_page
-    from ipsys_log.app.report.robot_run_figure import draw_drive, draw_panels, draw_paths
 
     result = read_robot_run(session)
     panels = [png(draw_panels(session, result, robot), _PANELS_DPI) for robot in result.robots]

@@ -125,8 +125,9 @@ def _best_lines(accuracies: Sequence[Accuracy], best: Accuracy) -> Iterator[str 
     cameras = {camera_row.camera for camera_row in (best.evaluation.cameras if best.evaluation else ())} - {
         POOLED
     }
+    scheme = "cross-validated" if row.scheme == CROSS_VALIDATION else "held out"
     yield (
-        f"({'3D' if space and not uses_height(best.model) else '2D'}, {_scheme(row)}: "
+        f"({'3D' if space and not uses_height(best.model) else '2D'}, {scheme}: "
         f"{counted(row.error_2d.count, 'point')} of {counted(len(cameras), 'camera')}; each pair of "
         "a camera and a point counts as one)."
     )
@@ -152,10 +153,6 @@ def _remaining_lines(errors: ErrorStatistics) -> Iterator[str]:
             f"Mean position error, after the stated error of the tape: {cm(errors.remaining_m)} cm "
             f"(95 % CI {low} to {high})."
         )
-
-
-def _scheme(row: CameraEvaluation) -> str:
-    return "cross-validated" if row.scheme == CROSS_VALIDATION else "held out"
 
 
 def _figures(errors: ErrorStatistics, rmse_m: float | None) -> str:

@@ -30,10 +30,12 @@ def truth_lines(imported: ImportedTruth) -> Iterator[str]:
     else:
         yield wrap_text(f"Alignment {align}: {_motion_text(imported)}.")
     if (residuals := imported.residuals) is not None:
+        count = residuals.outliers
+        outliers = f"; {counted(count, 'outlier')} not used for the estimate" if count else ""
         yield wrap_text(
             f"Residuals against run {imported.tracks_run}: RMSE {cm(residuals.rmse_2d_m)} cm on "
             f"the floor, {cm(residuals.rmse_3d_m)} cm in 3D, at {residuals.instants} instants"
-            f"{_outliers(residuals.outliers)}."
+            f"{outliers}."
         )
     if found is not None:
         what = "offset" if align == "none" else "offset and alignment"
@@ -56,10 +58,6 @@ def _motion_text(imported: ImportedTruth) -> str:
         if np.isfinite(sigma)
     ]
     return ", ".join(parts)
-
-
-def _outliers(count: int) -> str:
-    return f"; {counted(count, 'outlier')} not used for the estimate" if count else ""
 
 
 def truth_json(imported: ImportedTruth) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
 from ipsys_log.app.report.styles import camera_styles
-from ipsys_log.app.web.requests import ERROR_HANDLERS, MOST_DIGITS, answer_file, read_json, whole_number
+from ipsys_log.app.web.requests import ERROR_HANDLERS, MOST_DIGITS, file_routes, read_json, whole_number
 from ipsys_log.errors import IpsysError
 from ipsys_log.live_runs.survey.checks import (
     EntryCheck,
@@ -23,13 +23,7 @@ from ipsys_log.live_runs.survey.checks import (
     withdrawal_of,
 )
 from ipsys_log.live_runs.survey.entry import TypedEntry, parse_entry
-from ipsys_log.live_runs.survey.scene import (
-    CameraView,
-    MeasuringScene,
-    StationaryInterval,
-    observe_marker,
-    visible_markers,
-)
+from ipsys_log.live_runs.survey.scene import CameraView, MeasuringScene, observe_marker, visible_markers
 from ipsys_log.messages import Measurement
 from ipsys_log.statistics.calibration_points import (
     active_baselines,
@@ -79,7 +73,8 @@ def history_json(scene: MeasuringScene) -> dict[str, Any]:
         for measurement in reversed(history)
         if measurement.refers_to is None
     ]
-    return {"next": next_id(history), "places": rows, "measured": _measured(scene.intervals, active)}
+    measured = [next((m.id for m in active if interval.covers(m)), None) for interval in scene.intervals]
+    return {"next": next_id(history), "places": rows, "measured": measured}
 
 
 def _tapes(measurement: Measurement) -> str:
@@ -87,11 +82,6 @@ def _tapes(measurement: Measurement) -> str:
     side = [measurement.side] if measurement.side else []
     height = [f"height {measurement.height_m * CM_PER_M:.1f} cm"] if measurement.height_m is not None else []
     return ", ".join([*tapes, *side, *height])
-
-
-def _measured(intervals: Sequence[StationaryInterval], active: Sequence[Measurement]) -> list[str | None]:
-    """Return the id of the measurement of each stationary interval; None if it is not measured yet."""
-    return [next((m.id for m in active if interval.covers(m)), None) for interval in intervals]
 
 
 # A longer list of ids is not read.
@@ -170,12 +160,6 @@ def checked_json(checked: EntryCheck) -> dict[str, Any]:
     }
 
 
-_FILES = {
-    "/": ("measure.html", "text/html"),
-    "/measure.css": ("measure.css", "text/css"),
-    "/theme.css": ("theme.css", "text/css"),
-    **{f"/{name}.js": (f"{name}.js", "text/javascript") for name in ("measure", "cameras", "floor", "make")},
-}
 # Number of images that are kept for later requests, after the page got their addresses.
 _KEPT = 30
 
@@ -190,7 +174,7 @@ def build_app(scene: MeasuringScene, setup: str | None = None) -> Starlette:
     questions = _Questions(scene, setup)
     return Starlette(
         routes=[
-            *(Route(path, answer_file(*names)) for path, names in _FILES.items()),
+            *file_routes("measure", ("measure", "cameras", "floor", "make")),
             Route("/picture/{camera}/{time_ns}", questions.picture),
             Route("/api/scene", questions.scene),
             Route("/api/views", questions.views),

@@ -18,11 +18,9 @@ import cv2
 import uvicorn
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from ipsys_log.app.web.access import Guard
-from ipsys_log.app.web.app import build_app
 from ipsys_log.app.web.connections import Connections, PageLimits, derive_limits
+from ipsys_log.app.web.requests import Guard
 from ipsys_log.errors import IpsysError
-from ipsys_log.live_runs.survey.scene import MeasuringScene
 
 
 class ServerExceptions:
@@ -92,26 +90,6 @@ class PageServer:
         """Wait until the server ends, or until `stopped` is true."""
         while self.thread.is_alive() and not stopped():
             self.thread.join(_TURN_S)
-
-
-@contextmanager
-def serve(
-    scene: MeasuringScene, host: str | None = None, port: int = 8000, limits: PageLimits | None = None
-) -> Iterator[PageServer]:
-    """Serve the measuring page of a scene until the end of the with-block.
-
-    Parameters
-    ----------
-    scene : a finished log or live cameras.
-    host, port, limits : as for :func:`serve_app`.
-
-    Raises
-    ------
-    IpsysError
-        The errors of :func:`serve_app`.
-    """
-    with serve_app(build_app(scene), host, port, limits) as page:
-        yield page
 
 
 @contextmanager
@@ -194,13 +172,7 @@ async def _serve(
 
 
 def check_port_free(host: str | None, port: int, option: str = "--port") -> None:
-    """Check that a page can be served at an address and a port; ``option`` names the port in errors.
-
-    Raises
-    ------
-    IpsysError
-        The errors of :func:`serve`.
-    """
+    """Check that a page can be served at an address and a port; ``option`` names the port in errors."""
     _listen(host or _LOOPBACK, port, option).close()
 
 

@@ -15,6 +15,7 @@ from ipsys_log.calibration.joint.diagnosis import point_covariances, standardise
 from ipsys_log.calibration.joint.fit import Finding, JointFit, fit_jointly, fit_shape
 from ipsys_log.calibration.joint.moved_cameras import (
     CameraMotion,
+    explains_squares,
     find_motion,
     row_time_evidence,
     sum_squares,
@@ -392,7 +393,7 @@ def _try_motion(
         if not found:
             break
         later = max(found, key=lambda one: one.chi2)
-    if trial is None:
+    if trial is None or not explains_squares(fit, trial, motion):
         return None
     # The two poses of the trial have their own intrinsics, which may take a part of the turn.
     name = fit.observations.cameras[camera].name

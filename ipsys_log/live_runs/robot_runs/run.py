@@ -27,7 +27,8 @@ from ipsys_log.live_runs.robot_runs.wheels import Wheels
 from ipsys_log.messages import EVENTS_TOPIC, PATHS_TOPIC, CameraCalibration, Event, Message, Rig, RobotPath
 from ipsys_log.messages.channels import TRACKS
 from ipsys_log.sinks.sink import Sink
-from ipsys_log.sinks.streams.settings import Stream, open_streams
+from ipsys_log.sinks.streams.opening import Stream, open_streams
+from ipsys_log.sinks.streams.poses import StreamContext, first_session
 
 # The kind of the event with the settings of the run.
 ROBOT_RUN = "robot_run"
@@ -119,10 +120,10 @@ class _Parts:
             streams: list[Stream] = []
             for robots, settings in run.streams(ports):
                 heights_m = {robot: self.rig.robot_heights_m().get(robot) for robot in robots}
-                opened = open_streams(
-                    settings, [self.topic], cameras.clock.now_ns, cameras.add_event, heights_m=heights_m
-                )
-                streams += stack.enter_context(opened)
+                now_ns, warn = cameras.clock.now_ns, cameras.add_event
+                session = first_session(now_ns())
+                context = StreamContext(settings, [self.topic], now_ns, warn, session, heights_m)
+                streams += stack.enter_context(open_streams(context))
             programs: list[Programs] = []
 
             def check() -> None:

@@ -20,7 +20,7 @@ from ipsys_log.extras import check_installed
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.location import LogLocation
 from ipsys_log.messages import CameraCalibration, Waypoint
-from ipsys_log.sinks.streams.settings import StreamSettings
+from ipsys_log.sinks.streams import StreamSettings
 
 _LOOPBACK = "127.0.0.1"
 # Attempts to find any free port.

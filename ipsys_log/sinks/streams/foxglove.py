@@ -11,7 +11,7 @@ import hmac
 import http
 import logging
 import threading
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
@@ -35,7 +35,7 @@ from ipsys_log.sinks.streams.foxglove_messages import (
     write_advertise,
     write_server_info,
 )
-from ipsys_log.sinks.streams.poses import NewSession
+from ipsys_log.sinks.streams.poses import NewSession, StreamContext
 
 _BACKLOG = 16
 _MOST_CLIENTS = 32
@@ -305,3 +305,12 @@ class Client:
 def _is_closed(connection: ServerConnection) -> bool:
     # A connection gets its transport in the next turn of the loop.
     return hasattr(connection, "transport") and connection.transport.is_closing()
+
+
+def open_all(context: StreamContext) -> Iterator[FoxgloveStream]:
+    """Yield the server, if there is one."""
+    settings = context.settings
+    if settings.foxglove is not None:
+        where = settings.foxglove, settings.host, settings.secret
+        inputs = context.session, context.topics, context.warn
+        yield FoxgloveStream(*where, *inputs, settings.images, context.is_replayed)

@@ -4,9 +4,11 @@ The autopilots PX4 and ArduPilot expect x forward (here: north), y right (east) 
 clockwise from north, seen from above. docs/streams.md lists what each autopilot does with each field.
 """
 
+from __future__ import annotations
+
 import select
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from math import cos, nan, pi, sin
@@ -20,7 +22,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Message, Tracks
 from ipsys_log.sinks.sink import DropReport, Warn
 from ipsys_log.sinks.streams.addresses import find_destination, is_loopback, local_address, open_datagrams
-from ipsys_log.sinks.streams.poses import NewSession, PoseSource, StreamPose
+from ipsys_log.sinks.streams.poses import NewSession, PoseSource, StreamContext, StreamPose
 
 _NS_PER_US = 1000
 _RESETS = 256
@@ -284,3 +286,11 @@ class MavlinkStream:
         with suppress(Exception):  # any error of the parser: the datagram is not MAVLink
             messages = parser.parse_buffer(data) or []
         return messages
+
+
+def open_all(context: StreamContext) -> Iterator[MavlinkStream]:
+    """Yield a stream for each autopilot."""
+    host, north_rad = context.settings.host, context.settings.north_rad
+    for endpoint in [parse_endpoint(text) for text in dict.fromkeys(context.settings.mavlink)]:
+        poses = context.poses([endpoint.robot])
+        yield MavlinkStream(endpoint, host, poses, context.now_ns, context.warn, north_rad)

@@ -1,18 +1,19 @@
 """The poses that streams send: position, velocity, covariance, age, and the number of the session."""
 
 from collections import deque
-from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass, field
 from math import isfinite
 from typing import TypeVar
 
 import numpy as np
 
-from ipsys_log.messages import Mat33, Message, Track, Tracks
+from ipsys_log.messages import Message, Track, Tracks
+from ipsys_log.messages.message import Mat33
+from ipsys_log.sinks.sink import Warn
+from ipsys_log.sinks.streams import STALE_S, StreamSettings
 from ipsys_log.units import NS_PER_S
 
-# A robot of 0.26 m/s moves 13 cm in this time.
-STALE_S = 0.5
 # Tracks of earlier versions have no velocity. The duration of the poses that give one: a longer one is more
 # precise, and later by half of it.
 _WINDOW_NS, _SHORTEST_NS = NS_PER_S // 5, NS_PER_S // 20
@@ -143,6 +144,41 @@ class PoseSource:
         yield StreamPose(
             self._session, self._sequence, time_ns, age_s, track, recent.velocity(), unseen_s > self._stale_s
         )
+
+
+@dataclass(frozen=True, slots=True)
+class StreamContext:
+    """The inputs that the streams of a command share.
+
+    Attributes
+    ----------
+    topics : the topics of the tracks.
+    now_ns : the clock of the ages.
+    warn : makes an event for lost messages.
+    session : the number of the first session.
+    heights_m : all robots of the rig, announced before they are seen, with the heights of their markers
+        (None: unknown).
+    is_replayed : the times are those of a recording.
+    """
+
+    settings: StreamSettings
+    topics: Collection[str]
+    now_ns: Callable[[], int]
+    warn: Warn
+    session: int
+    heights_m: Mapping[str, float | None] = field(default_factory=dict)
+    is_replayed: bool = False
+
+    @property
+    def streamed_heights_m(self) -> dict[str, float | None]:
+        """The robots of the rig that the streams send, with the heights of their markers."""
+        robots = self.settings.robots or self.heights_m
+        return {name: height_m for name, height_m in self.heights_m.items() if name in robots}
+
+    def poses(self, robots: Collection[str] = ()) -> PoseSource:
+        """Return the poses of some robots; without names, those of the settings."""
+        named = robots or self.settings.robots
+        return PoseSource(self.topics, self.now_ns, self.session, named, self.settings.stale_s)
 
 
 def _finite(value: _Value | None) -> _Value | None:

@@ -2,7 +2,7 @@
 
 import socket
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import zenoh
@@ -13,7 +13,7 @@ from ipsys_log.messages import Message, Tracks
 from ipsys_log.sinks.sink import DropReport, Warn
 from ipsys_log.sinks.streams import ros2_messages as ros2
 from ipsys_log.sinks.streams.addresses import LOOPBACK, is_loopback, listen
-from ipsys_log.sinks.streams.poses import NewSession, PoseSource, StreamPose
+from ipsys_log.sinks.streams.poses import NewSession, PoseSource, StreamContext, StreamPose
 from ipsys_log.sinks.streams.rmw_zenoh import Entity, Publisher, Qos, configure
 from ipsys_log.sinks.streams.ros2_messages import is_stampable, type_hash
 
@@ -211,3 +211,12 @@ def _has_other(session: zenoh.Session) -> bool:
         if not list(session.liveliness().get(token, timeout=_QUERY_S)):
             return False
     return True
+
+
+def open_all(context: StreamContext) -> Iterator[Ros2Stream]:
+    """Yield the node, if there is one."""
+    settings, heights_m = context.settings, context.streamed_heights_m
+    if settings.ros2 is not None:
+        where = settings.ros2, settings.ros2_domain, settings.host
+        inputs = context.poses(), context.now_ns, context.warn
+        yield Ros2Stream(*where, *inputs, heights_m, context.is_replayed)

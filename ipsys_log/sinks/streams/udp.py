@@ -4,6 +4,7 @@ import hashlib
 import hmac
 import json
 import socket
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Mat33, Message, Tracks
 from ipsys_log.sinks.sink import DropReport, Warn
 from ipsys_log.sinks.streams.addresses import find_destination, is_loopback, local_address, open_datagrams
-from ipsys_log.sinks.streams.poses import NewSession, PoseSource, StreamPose
+from ipsys_log.sinks.streams.poses import NewSession, PoseSource, StreamContext, StreamPose
 
 # The version of the datagram: a receiver drops other versions.
 FORMAT = 1
@@ -154,3 +155,11 @@ class UdpStream:
             self._drops.add("the system has no room for more datagrams")
         except OSError as error:
             self._drops.add(str(error.strerror))
+
+
+def open_all(context: StreamContext) -> Iterator[UdpStream]:
+    """Yield a stream for each destination."""
+    settings = context.settings
+    key = None if settings.key is None else read_key(settings.key)
+    for target in dict.fromkeys(settings.udp):
+        yield UdpStream(target, settings.host, context.poses(), context.warn, key)

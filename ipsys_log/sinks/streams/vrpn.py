@@ -6,7 +6,7 @@ import errno
 import selectors
 import socket
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 
 from ipsys_log.capture.frames import Clock
@@ -14,7 +14,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Message, Tracks
 from ipsys_log.sinks.sink import DropReport, Warn
 from ipsys_log.sinks.streams.addresses import LOOPBACK, is_loopback, refuse_bind
-from ipsys_log.sinks.streams.poses import NewSession, PoseSource, StreamPose
+from ipsys_log.sinks.streams.poses import NewSession, PoseSource, StreamContext, StreamPose
 from ipsys_log.sinks.streams.vrpn_messages import (
     DISCONNECT,
     GREETING,
@@ -32,7 +32,6 @@ from ipsys_log.sinks.streams.vrpn_messages import (
 )
 from ipsys_log.units import NS_PER_S
 
-PORT = 3883
 _MOST_CLIENTS, _MOST_CALLBACKS = 32, 4
 _MOST_ROBOTS = 256
 _LONGEST_NAME = 99  # bytes; the limit of the protocol
@@ -252,6 +251,13 @@ def _listen(host: str, port: int) -> tuple[socket.socket, socket.socket]:
     listening.setblocking(False)
     asking.setblocking(False)
     return listening, asking
+
+
+def open_all(context: StreamContext) -> Iterator[VrpnStream]:
+    """Yield the server, if there is one."""
+    settings, robots = context.settings, list(context.streamed_heights_m)
+    if settings.vrpn is not None:
+        yield VrpnStream(settings.vrpn, settings.host, context.poses(), context.warn, robots)
 
 
 # About 200 poses with velocities: a client that is so far behind loses further ones.

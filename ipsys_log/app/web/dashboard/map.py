@@ -11,7 +11,8 @@ import cv2
 import numpy as np
 
 from ipsys_log.app.report.styles import camera_styles, robot_colour, shorten
-from ipsys_log.messages import Array, CameraCalibration, Mat33, Model, Rig, Track, Tracks
+from ipsys_log.messages import Array, CameraCalibration, Model, Rig, Track, Tracks
+from ipsys_log.sinks.video.floor_map import covariance_ellipse
 from ipsys_log.statistics.floor_cameras import outline_view, read_floor_cameras
 from ipsys_log.units import NS_PER_S
 
@@ -25,8 +26,6 @@ _TRAIL_NS, _TRAIL_STEP_NS = 10 * NS_PER_S, NS_PER_S // 10
 _GONE_NS = 60 * NS_PER_S
 # A log may name any number of robots; more do not fit on a page.
 _MOST_ROBOTS = 200
-# The 95 % quantile of the chi-squared distribution with two degrees of freedom, and its square root.
-_SCALE_95 = math.sqrt(5.991464547107979)
 _DECIMALS = 4  # of m and rad
 
 
@@ -95,31 +94,6 @@ def _rounded(points_m: Array) -> Any:
     return points_m.round(_FLOOR_DECIMALS).tolist()
 
 
-def ellipse_of(covariance_m2: Mat33) -> tuple[float, float, float] | None:
-    """Return the ellipse in x and y that contains a position with a probability of 95 %.
-
-    Parameters
-    ----------
-    covariance_m2 : (3, 3), covariance of a position.
-
-    Returns
-    -------
-    Long and short semi-axis in m, and the angle from x to the long one in rad; None if an entry is no number.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> [round(value, 3) for value in ellipse_of(np.diag([4e-4, 1e-4, 9.0]))]
-    [0.049, 0.024, 0.0]
-    """
-    xx, xy, yy = float(covariance_m2[0, 0]), float(covariance_m2[0, 1]), float(covariance_m2[1, 1])
-    middle, radius = (xx + yy) / 2, math.hypot((xx - yy) / 2, xy)
-    if not math.isfinite(middle + radius):
-        return None
-    long_m, short_m = (_SCALE_95 * math.sqrt(max(value, 0.0)) for value in (middle + radius, middle - radius))
-    return long_m, short_m, math.atan2(2 * xy, xx - yy) / 2
-
-
 class Robots:
     """The newest poses of the robots. Times of the JSON are in ms since ``begin_ns``.
 
@@ -184,8 +158,8 @@ class Robots:
             row["colour"] = self._colours.setdefault(track.robot, robot_colour(len(self._colours)))
         if track.heading_rad is not None and math.isfinite(track.heading_rad):
             row["heading"] = round(track.heading_rad, _DECIMALS)
-        ellipse = None if track.covariance_m2 is None else ellipse_of(track.covariance_m2)
-        if ellipse is not None:
+        if track.covariance_m2 is not None and np.isfinite(track.covariance_m2[:2, :2]).all():
+            ellipse = covariance_ellipse(track.covariance_m2[:2, :2])
             row["ellipse"] = [round(value, _DECIMALS + 1) for value in ellipse]
         if track.inside is False:
             row["outside"] = True

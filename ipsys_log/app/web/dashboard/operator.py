@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from ipsys_log.app.web.access import OperatorSeat
+from ipsys_log.app.web.requests import OperatorSeat
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import EVENTS_TOPIC, Event
 from ipsys_log.messages.events import MARK, SEGMENT_ENDED, SEGMENT_STARTED
@@ -23,6 +23,9 @@ class Segment(NamedTuple):
 
 class Operator:
     """The actions of the operator; each is an event in the log. For one thread.
+
+    An action raises an IpsysError if another device operates, its text is empty or too long, no segment or
+    another one has started, or the recording has ended.
 
     Parameters
     ----------
@@ -54,26 +57,13 @@ class Operator:
         return self.seat.version + self._written
 
     def mark(self, number: int, text: str) -> None:
-        """Write a remark of the operator to the log.
-
-        Raises
-        ------
-        IpsysError
-            Another device operates, the text is empty or too long, or the recording has ended.
-        """
+        """Write a remark of the operator to the log."""
         self.seat.check(number)
         now_ns = self._now_ns()
         self._write(Event(now_ns, MARK, _clean(text, _LONGEST_TEXT, "the text of the mark")), "mark: ")
 
     def start_segment(self, number: int, name: str) -> None:
-        """Start a named segment.
-
-        Raises
-        ------
-        IpsysError
-            Another device operates, a segment has not ended, the name is empty or too long, or the recording
-            has ended.
-        """
+        """Start a named segment."""
         self.seat.check(number)
         if self.segment is not None:
             raise IpsysError(f"the segment {self.segment.name} has not ended; stop it first")
@@ -83,13 +73,7 @@ class Operator:
         self.segment = Segment(name, start_ns)
 
     def end_segment(self, number: int) -> None:
-        """End the segment that has started.
-
-        Raises
-        ------
-        IpsysError
-            Another device operates, no segment has started, or the recording has ended.
-        """
+        """End the segment that has started."""
         self.seat.check(number)
         if self.segment is None:
             raise IpsysError("no segment has started; start one first")
@@ -105,13 +89,7 @@ class Operator:
 
 
 def _clean(text: str, longest: int, subject: str) -> str:
-    """Return a typed text on one line, without control characters.
-
-    Raises
-    ------
-    IpsysError
-        The text is empty or too long.
-    """
+    """Return a typed text on one line, without control characters."""
     cleaned = plain_text(" ".join(text.split()))
     if not cleaned:
         raise IpsysError(f"{subject} is empty; type a text")

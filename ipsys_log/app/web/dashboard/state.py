@@ -39,8 +39,8 @@ from ipsys_log.messages import (
     Tracks,
 )
 from ipsys_log.sinks.selection import PlayedScene
+from ipsys_log.sinks.streams.opening import Stream
 from ipsys_log.sinks.streams.poses import NewSession
-from ipsys_log.sinks.streams.settings import Stream
 from ipsys_log.statistics.disagreement import OverlapSummary
 from ipsys_log.units import NS_PER_S
 
@@ -91,11 +91,6 @@ class Dashboard:
     Attributes
     ----------
     end : None as long as messages come, then ``ended``, or ``failed`` after an error of this sink.
-
-    Raises
-    ------
-    IpsysError
-        The model or the intrinsics of a camera are not valid.
     """
 
     name = "the dashboard"

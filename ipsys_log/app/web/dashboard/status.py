@@ -14,7 +14,7 @@ from ipsys_log.capture.live_check import FrameCheck
 from ipsys_log.messages import CAMERA_MOVED, FRAME_SKIPPED, STAMP_UNRELIABLE, Event, Latency
 from ipsys_log.messages.events import OPERATOR_KINDS
 from ipsys_log.plain_text import plain_text
-from ipsys_log.sinks.streams.settings import Stream
+from ipsys_log.sinks.streams.opening import Stream
 from ipsys_log.statistics.latency import latency_percentiles, step_times_s
 from ipsys_log.units import NS_PER_S
 

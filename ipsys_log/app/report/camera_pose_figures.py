@@ -1,24 +1,29 @@
-"""Figure of the alignment: the coverage of the floor, and the direction to tilt each camera."""
+"""Figures of the poses of cameras: the alignment on the floor and in the images, and the drift over time."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
+from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 from matplotlib.figure import Figure
 
 from ipsys_log.app.report.alignment import AlignedLab
-from ipsys_log.app.report.figures import add_panel, legend_label, name_cameras, save_figure
+from ipsys_log.app.report.figures import add_panel, legend_label, name_cameras, save_figure, style_axes
 from ipsys_log.app.report.floor_figure import draw_ground
 from ipsys_log.app.report.styles import NOTE, REST, camera_styles, shorten
+from ipsys_log.live_runs.survey.drift_reading import DriftReading
 from ipsys_log.messages import CameraCalibration
 from ipsys_log.statistics.alignment import Alignment
+from ipsys_log.statistics.camera_moves import CameraState
 from ipsys_log.statistics.coverage import FloorCoverage
-from ipsys_log.units import CM_PER_M
+from ipsys_log.statistics.drift import LEAST_SHIFT_M
+from ipsys_log.units import CM_PER_M, MM_PER_M, NS_PER_S
 from ipsys_log.vision.lenses import project
 
 _DPI = 100
@@ -36,11 +41,6 @@ def draw_alignment(lab: AlignedLab, path: Path) -> None:
     On the left is the floor map, if the coverage is known. On the right is the image of each camera with its
     markers. Each marker shows the difference of its Zc from the median. An arrow shows the direction to turn
     the camera.
-
-    Parameters
-    ----------
-    lab : the alignment to draw.
-    path : path of the figure; an existing file is replaced. The suffix gives the file format.
     """
     floor = lab.coverage is not None
     columns = -(-len(lab.alignments) // _ROWS)
@@ -166,3 +166,55 @@ def _draw_arrow(axes: Axes, one: Alignment, lens: CameraCalibration) -> None:
         color=_TILTED, weight="bold", zorder=5,
         bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none"},
     )  # fmt: skip
+
+
+_NORMAL_95 = 1.96
+# Rows of the legend; further cameras are in further columns.
+_LEGEND_ROWS = 8
+
+
+def draw_drift(reading: DriftReading, path: Path) -> None:
+    """Draw one line for each camera over the logs, with its 95 % band and the times of the moves.
+
+    A file in pixels has 1200 x 600 pixels.
+    """
+    figure = Figure(figsize=(12, 6), dpi=100, layout="constrained")
+    axes = figure.add_subplot()
+    drift = reading.drift
+    styles = camera_styles(drift.baselines)
+    for camera in sorted(drift.baselines):
+        states = [state for state in drift.of_camera(camera) if state.motion is not None]
+        if states:
+            _draw_camera(axes, camera, states, styles[camera])
+    for move in drift.moves:
+        moment = datetime.fromtimestamp(move.after_ns / NS_PER_S, UTC)
+        axes.axvline(moment, color=styles[move.camera][0], ls=":", lw=1.4)  # type: ignore[arg-type]
+        axes.annotate(
+            f"{shorten(move.camera)} moved", (moment, 1.0), (3, -4), xycoords=("data", "axes fraction"),
+            textcoords="offset points", va="top", ha="left", rotation=90, fontsize=8,
+        )  # fmt: skip
+    least_mm = LEAST_SHIFT_M * MM_PER_M
+    axes.axhline(least_mm, color=NOTE, lw=1, ls="--", label=f"least reported shift, {least_mm:.1f} mm")
+    locator = AutoDateLocator()  # type: ignore[no-untyped-call]
+    axes.xaxis.set_major_locator(locator)
+    axes.xaxis.set_major_formatter(ConciseDateFormatter(locator))  # type: ignore[no-untyped-call]
+    axes.set(ylabel="mean shift of the floor map in mm", ylim=(0, None))
+    axes.set_title(
+        f"Drift of the cameras since {shorten(reading.names[0])}; bands: 95 %", loc="left", fontsize=11
+    )
+    style_axes(axes)
+    columns = -(-len(drift.baselines) // _LEGEND_ROWS)
+    axes.legend(loc="upper left", fontsize=9 if columns == 1 else 7, ncols=columns, frameon=False)
+    save_figure(figure, path)
+
+
+def _draw_camera(axes: Axes, camera: str, states: Sequence[CameraState], style: tuple[str, str]) -> None:
+    """Draw the line of a camera, with its band."""
+    colour, shape = style
+    times = np.array([datetime.fromtimestamp(state.time_ns / NS_PER_S, UTC) for state in states])
+    motions = [state.motion for state in states if state.motion]
+    means_mm = np.array([motion.mean_shift_m for motion in motions]) * MM_PER_M
+    half_mm = np.array([motion.sigma_m for motion in motions]) * MM_PER_M * _NORMAL_95
+    low_mm = np.maximum(means_mm - half_mm, 0.0)
+    axes.fill_between(times, low_mm, means_mm + half_mm, color=colour, alpha=0.18, lw=0)
+    axes.plot(times, means_mm, "-" + shape, color=colour, ms=6, lw=1.6, label=shorten(camera))

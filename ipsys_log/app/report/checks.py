@@ -1,22 +1,127 @@
-"""The result of a repair as text: saved and lost messages."""
+"""Results of checks and repairs as text and JSON: findings, differences, saved and lost messages."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from math import ceil
+from typing import Any
 
-from ipsys_log.app.report.rows import Rows
+from rich.text import Text
+
+from ipsys_log.app.report.rows import Rows, counted
 from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.output import IMAGE_SCHEMAS
 from ipsys_log.log.reader import LogReader
 from ipsys_log.log.recovery import RepairReport
-from ipsys_log.units import NS_PER_S, format_bytes, format_time
+from ipsys_log.plain_text import plain_text
+from ipsys_log.tools.differences import Comparison
+from ipsys_log.tools.soundness.finding import BROKEN, SOUND, UNREAD, LogCheck, LogFinding
+from ipsys_log.units import CM_PER_M, NS_PER_S, format_bytes, format_time
 
+_MOST_LINES = 30
 # A recorder flushes its messages at least once in this time.
 _FLUSH_NS = NS_PER_S
 # If a file was written this long after its last message, it was copied later, or recorded by another clock.
 _COPIED_NS = 10 * NS_PER_S
 _MOST_NOTES = 12
+
+
+def check_json(checks: Sequence[LogCheck]) -> dict[str, Any]:
+    """Return the results as plain data; notes are included, and missing values are left out."""
+    return {
+        "state": LogCheck.worst(checks),
+        "logs": [
+            {
+                "path": str(check.path),
+                "state": check.state,
+                "findings": [
+                    {key: value for key, value in asdict(finding).items() if value not in (None, "")}
+                    for finding in check.findings
+                ],
+            }
+            for check in checks
+        ],
+    }
+
+
+def check_lines(check: LogCheck, details: bool = False) -> Iterator[str]:
+    """Yield the answer for a log, then a line for each finding; notes only with ``details``."""
+    findings = check.findings if details else check.remarks
+    yield f"{check.path}: {_answer(check)}"
+    for finding in findings[:_MOST_LINES]:
+        if finding is not _first_fault(check):
+            yield f"  {_finding_line(finding)}"
+        elif finding.advice:
+            yield f"  {finding.advice}"
+    if len(findings) > _MOST_LINES:
+        yield f"  and {len(findings) - _MOST_LINES} more: --json lists all"
+
+
+def _first_fault(check: LogCheck) -> LogFinding | None:
+    return next((finding for finding in check.findings if finding.level in (BROKEN, UNREAD)), None)
+
+
+def _answer(check: LogCheck) -> str:
+    fault = _first_fault(check)
+    if fault is not None:
+        return f"{check.state}: {plain_text(fault.text)}"
+    number = len(check.remarks)
+    return SOUND if not number else f"readable, {counted(number, 'remark')}"
+
+
+def _finding_line(finding: LogFinding) -> str:
+    """Return the place, the fault and the advice of a finding in one line."""
+    place = [finding.topic] if finding.topic else []
+    place += [f"at {format_time(finding.time_ns)}"] if finding.time_ns is not None else []
+    place += [f"({finding.count} messages)"] if finding.count is not None and finding.count > 1 else []
+    title = f"{' '.join(place)}: " if place else ""
+    advice = f"; {finding.advice}" if finding.advice else ""
+    return plain_text(f"{title}{finding.text}{advice}")
+
+
+def comparison_table(found: Sequence[Comparison], sides: tuple[str, str]) -> Rows:
+    """Return a table with one row per channel; ``sides`` are the headings of the two compared sides."""
+    cells: list[list[str | Text]] = []
+    for one in found:
+        topic = Text(plain_text(one.topic.removeprefix("/runs/")), style="" if one.equal else "red")
+        distances = (_distance(value, one.unit) for value in (one.rms, one.greatest))
+        cells.append([topic, str(one.left), str(one.right), _same_text(one), *distances])
+    columns = ("channel", *(f">{side}" for side in sides), ">same", ">RMS diff", ">max diff")
+    return Rows("", columns, cells)
+
+
+def _same_text(comparison: Comparison) -> str:
+    if not comparison.equal:
+        return str(comparison.same)
+    return "all" if comparison.repeated else "as written"
+
+
+def first_difference(found: Sequence[Comparison]) -> str | None:
+    """Return the first difference of two sides as text; None if they are equal."""
+    different = [comparison for comparison in found if not comparison.equal]
+    if not different:
+        return None
+    if not any(comparison.together for comparison in found if comparison.left > 1):
+        return "the two sides have no frame in common: no two messages have the same time"
+    first = min(different, key=lambda one: one.first_ns or 0)
+    return f"first difference in {first.topic}: {first.first}"
+
+
+def _distance(value: float | None, unit: str | None) -> str:
+    if value is None:
+        return ""
+    if value == 0:
+        return "0"
+    return f"{value:.2g} px" if unit == "px" else f"{value * CM_PER_M:.2g} cm"
+
+
+def comparison_json(found: Sequence[Comparison]) -> dict[str, Any]:
+    """Return the comparison as plain data: whether all channels are equal, and each channel."""
+    return {
+        "equal": all(comparison.equal for comparison in found),
+        "channels": [asdict(comparison) for comparison in found],
+    }
 
 
 def repair_lines(report: RepairReport) -> Iterator[str | Rows]:

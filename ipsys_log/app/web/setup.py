@@ -16,11 +16,18 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from ipsys_log.app.first_day.lab_folder import LabFolder
 from ipsys_log.app.first_day.session import Pages, SetupSession
 from ipsys_log.app.first_day.work import LiveRecording
-from ipsys_log.app.web.access import MAY_WRITE, OperatorSeat, answer_claim, operator_of
 from ipsys_log.app.web.app import build_app
 from ipsys_log.app.web.dashboard.app import build_dashboard, dashboard_of_recording
 from ipsys_log.app.web.dashboard.state import Dashboard
-from ipsys_log.app.web.requests import ERROR_HANDLERS, answer_file, read_json
+from ipsys_log.app.web.requests import (
+    ERROR_HANDLERS,
+    MAY_WRITE,
+    OperatorSeat,
+    answer_claim,
+    file_routes,
+    operator_of,
+    read_json,
+)
 from ipsys_log.errors import IpsysError
 from ipsys_log.live_runs.survey.entry import Fault
 from ipsys_log.live_runs.survey.live import LiveScene
@@ -28,15 +35,7 @@ from ipsys_log.statistics.calibration_points import active_measurements
 
 Body = Mapping[str, Any]
 
-_OWN = "ipsys_log.app.web.first_day"
 _SCRIPTS = ("setup", "panels", "fields", "pictures")
-_FILES = {
-    "/": ("setup.html", "text/html", _OWN),
-    "/setup.css": ("setup.css", "text/css", _OWN),
-    "/theme.css": ("theme.css", "text/css"),
-    **{f"/{name}.js": (f"{name}.js", "text/javascript") for name in ("make", "operator")},
-    **{f"/{name}.js": (f"{name}.js", "text/javascript", _OWN) for name in _SCRIPTS},
-}
 
 
 class _Embedded:
@@ -78,7 +77,7 @@ class SetupApp:
         self.session = SetupSession(folder, Pages(self._show_measuring, self._show_dashboard))
         self.app = Starlette(
             routes=[
-                *(Route(path, answer_file(*names)) for path, names in _FILES.items()),
+                *file_routes("setup", _SCRIPTS, "first_day", ("make", "operator")),
                 Route("/picture/{kind}/{name}", self._picture),
                 Route("/print/{name}.pdf", self._print),
                 Route("/api/state", self._state),
@@ -167,13 +166,7 @@ class SetupApp:
 
 
 def _texts(body: Mapping[str, Any], key: str) -> dict[str, str]:
-    """Return an object of texts in a request.
-
-    Raises
-    ------
-    IpsysError
-        The value is not an object.
-    """
+    """Return an object of texts in a request; another value is an error."""
     value = body.get(key)
     if not isinstance(value, dict):
         raise IpsysError(f"{key} must be an object of texts; reload this page")

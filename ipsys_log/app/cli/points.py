@@ -1,57 +1,48 @@
-"""Tape measurements of a log, and their exclusion: ``ipsys measure`` and ``ipsys exclude``."""
+"""Calibration points of a log: ``ipsys measure``, ``ipsys exclude`` and ``ipsys plan``."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ipsys_log.app.cli.console import console, print_json, progress_bar, say, warn
-from ipsys_log.app.cli.lab_inputs import cameras_of, load_calibrations, load_matching_rig
-from ipsys_log.app.cli.options import (
-    AsJson,
-    Calibrations,
-    Corners,
-    Host,
-    Port,
-    RigFile,
-    Terminal,
-    appended_log_argument,
-)
+from ipsys_log.app.cli import options as cli
+from ipsys_log.app.cli.console import console, print_json, print_result, progress_bar, say, warn
+from ipsys_log.app.cli.lab_inputs import cameras_of, lab_of_run, load_calibrations, load_matching_rig
+from ipsys_log.app.cli.options import appended_log_argument, figure_option, setting, switch
 from ipsys_log.app.cli.pages import serve_measuring
 from ipsys_log.app.cli.signals import SAVED, allow_interrupt, runs_until_stopped, stop_on_signal
+from ipsys_log.app.cli.stages import derive
+from ipsys_log.app.report.rows import counted
+from ipsys_log.errors import IpsysError
+from ipsys_log.extras import check_installed
 from ipsys_log.plain_text import shell_words
 
 if TYPE_CHECKING:
-    from ipsys_log.live_runs.survey.from_log import FinishedLog
+    from ipsys_log.live_runs.survey.floor_plan import PlannedFloor
     from ipsys_log.live_runs.survey.scene import MeasuringScene
-    from ipsys_log.messages import Measurement
+    from ipsys_log.messages import Measurement, Rig
 
 Log = Annotated[Path, appended_log_argument(help="A finished log, which gets the measurements.")]
 Sheet = Annotated[
     Path | None,
-    typer.Option(
-        "--csv",
-        metavar="SHEET",
-        help="Read the measurements from a sheet; docs/measuring.md shows the columns.",
-    ),
+    setting("--csv", "SHEET", "Read the measurements from a sheet; docs/measuring.md shows the columns."),
 ]
-Insist = Annotated[bool, typer.Option("--force", help="With --csv: write rows that look wrong, too.")]
+Insist = Annotated[bool, switch("--force", "With --csv: write rows that look wrong, too.")]
 Places = Annotated[
     bool,
-    typer.Option(
-        "--places", help="Only list the stationary intervals of the markers, with their numbers for a sheet."
-    ),
+    switch("--places", "Only list the stationary intervals of the markers, with their numbers for a sheet."),
 ]
 Baseline = Annotated[
     str | None,
-    typer.Option(
+    setting(
         "--ab",
-        metavar="CM",
-        help="The distance between the first two reference points, read with this tape, in cm. It shows the "
+        "CM",
+        "The distance between the first two reference points, read with this tape, in cm. It shows the "
         "scale of the tape if the rig has ab_sigma_m.",
     ),
 ]
@@ -63,17 +54,17 @@ _MODEL, _GOOD = "poly", 40
 @runs_until_stopped
 def measure(
     log: Log,
-    terminal: Terminal = False,
+    terminal: cli.Terminal = False,
     csv: Sheet = None,
     places: Places = False,
     ab: Baseline = None,
-    host: Host = None,
-    port: Port = 8000,
-    rig: RigFile = None,
-    calibration: Calibrations = None,
-    corners: Corners = None,
+    host: cli.Host = None,
+    port: cli.Port = 8000,
+    rig: cli.RigFile = None,
+    calibration: cli.Calibrations = None,
+    corners: cli.Corners = None,
     force: Insist = False,
-    as_json: AsJson = False,
+    as_json: cli.AsJson = False,
 ) -> None:
     """Enter the tape measurements of a log: on a page for the phone, in the terminal, or from a sheet.
 
@@ -90,8 +81,6 @@ def measure(
     ends = csv is not None or places or ab is not None
     allow_interrupt(None if ends else SAVED)
     from ipsys_log.engine.request import Request
-    from ipsys_log.errors import IpsysError
-    from ipsys_log.extras import check_installed
     from ipsys_log.live_runs.survey.from_log import open_finished_log
     from ipsys_log.live_runs.survey.sheet import add_sheet, check_sheet
 
@@ -110,7 +99,10 @@ def measure(
         with progress_bar() as progress:
             scene = stack.enter_context(open_finished_log(log, request, progress, say))
         if places:
-            _show_places(scene, as_json)
+            from ipsys_log.app.report.contents import intervals_json, intervals_table
+
+            stops = intervals_json(scene)
+            print_result(stops, [intervals_table(stops)], as_json)
             return
         before = len(scene.history())
         if ab is not None:
@@ -143,18 +135,16 @@ def _serve(scene: MeasuringScene, host: str | None, port: int) -> None:
 
 def exclude(
     log: Annotated[
-        Path,
-        appended_log_argument(help="A finished log with measurements, which gets the change."),
+        Path, appended_log_argument(help="A finished log with measurements, which gets the change.")
     ],
     points: Annotated[
-        list[str],
-        typer.Argument(metavar="POINT", help="Names of calibration points, such as p007."),
+        list[str], typer.Argument(metavar="POINT", help="Names of calibration points, such as p007.")
     ],
-    reason: Annotated[str, typer.Option(metavar="TEXT", help="The reason, which is written into the log.")],
+    reason: Annotated[str, setting("--reason", "TEXT", "The reason, which is written into the log.")],
     readmit: Annotated[
-        bool, typer.Option("--readmit", help="Use excluded points again, instead of excluding points.")
+        bool, switch("--readmit", "Use excluded points again, instead of excluding points.")
     ] = False,
-    as_json: AsJson = False,
+    as_json: cli.AsJson = False,
 ) -> None:
     """Exclude calibration points of a log from all stages, or re-admit them. Nothing is erased.
 
@@ -199,7 +189,7 @@ def show_measured(
         baselines = sum(measurement.from_reference is not None for measurement in added)
         also = f", {baselines} distance AB" if baselines else ""
         also += f", {withdrawn} withdrawn" if withdrawn else ""
-        console.print(f"{count} point{'' if count == 1 else 's'} measured into {log}{also}")
+        console.print(f"{counted(count, 'point')} measured into {log}{also}")
     active = len(active_measurements(history))
     if 0 < active < _GOOD:
         say(
@@ -210,11 +200,102 @@ def show_measured(
         say(f"next: ipsys replay {shell_words(log)}")
 
 
-def _show_places(scene: FinishedLog, as_json: bool) -> None:
-    from ipsys_log.app.report.contents import intervals_json, intervals_table
+_MOST_PLACES = 50
+# Without a floor in the rig, this is the largest height of a marker.
+_HIGHEST_M = 5.0
 
-    stops = intervals_json(scene)
-    if as_json:
-        print_json(stops)
-    else:
-        console.print(intervals_table(stops))
+Count = Annotated[int, setting("--places", "N", "Number of points to propose.")]
+Model = Annotated[str, setting("--model", "NAME", "The model to improve.")]
+Heights = Annotated[
+    list[float] | None,
+    setting(
+        "--height-m",
+        "METRES",
+        "Height of the marker above the floor, in m; repeat it for several. Default: the heights of the "
+        "measured points, in turn.",
+    ),
+]
+Plot = Annotated[Path | None, figure_option("the error over the floor, before and after")]
+
+
+def plan(
+    logs: cli.Logs,
+    places: Count = 5,
+    model: Model = "best",
+    height_m: Heights = None,
+    train: cli.Train = "train",
+    rig: cli.RigFile = None,
+    calibration: cli.Calibrations = None,
+    plot: Plot = None,
+    as_json: cli.AsJson = False,
+) -> None:
+    """Propose the next points to measure, which reduce the predicted error over the floor most.
+
+    For the model joint, the command proposes a drive of a robot, too. Its errors are those of the calibration
+    alone, without the noise of an image.
+
+    If the log has no such model yet, the command fits one first.
+
+    Examples
+
+        ipsys plan calibration.mcap --places 5 --plot next.png
+    """
+    from ipsys_log.engine.graph import writes
+    from ipsys_log.engine.request import copied_run
+    from ipsys_log.live_runs.survey.floor_plan import plan_floor
+    from ipsys_log.messages.channels import MODEL
+    from ipsys_log.messages.rig_file import load_rig
+
+    given_rig = load_rig(rig) if rig else None
+    lenses = load_calibrations(calibration, lambda: cameras_of(logs))
+    _check(logs, given_rig, model, places, height_m or ())
+    options: dict[str, Any] = {"train": train, "rig": rig, "calibration": calibration, "run": None}
+    with derive(logs, "fit", model=[model], **options) as (session, outcomes, _):
+        fitted = [outcome.run for outcome in outcomes if writes(outcome, MODEL)]
+        run = fitted[-1] if fitted else str(copied_run(session, model))
+        in_force, all_lenses = lab_of_run(session, run, given_rig, lenses)
+        planned = plan_floor(session, run, in_force, all_lenses, places, height_m or ())
+    _show(planned, plot, as_json)
+
+
+def _show(found: PlannedFloor, plot: Path | None, as_json: bool) -> None:
+    from ipsys_log.app.report.calibration import plan_json, plan_lines, plan_table
+
+    print_result(plan_json(found), (plan_table(found), *plan_lines(found)), as_json, found.notes)
+    if plot is not None:
+        from ipsys_log.app.report.expected_error_figures import draw_plan
+
+        draw_plan(found, plot)
+        say(f"{plot} drawn")
+
+
+def _check(logs: cli.LogList, rig: Rig | None, model: str, places: int, heights_m: Sequence[float]) -> None:
+    """Check that a plan is possible, before a model is fitted."""
+    from ipsys_log.engine.request import copied_run
+    from ipsys_log.engine.view import LogView
+    from ipsys_log.log.dataset import Session
+    from ipsys_log.messages.channels import RIG
+    from ipsys_log.statistics.calibration_points import measured
+
+    if not 1 <= places <= _MOST_PLACES:
+        raise IpsysError(
+            f"--places {places}: is not between 1 and {_MOST_PLACES}; plan fewer points, measure them, and "
+            "plan again"
+        )
+    with Session(logs) as session:
+        rigs = [rig] if rig is not None else session.payloads(session.topics(RIG))
+        spans_m = [
+            max(checked_rig.floor.width_m, checked_rig.floor.depth_m)
+            for checked_rig in rigs
+            if checked_rig.floor is not None
+        ]
+        for height_m in heights_m:
+            if not (math.isfinite(height_m) and 0 <= height_m <= max(spans_m, default=_HIGHEST_M)):
+                raise IpsysError(
+                    f"--height-m {height_m:g}: is not a height in this lab; give metres, such as 0.15"
+                )
+        if not measured(LogView(session, rig=rig)) and copied_run(session, model) is None:
+            raise IpsysError(
+                f"{session}: has no calibration points, so a plan is not possible; first measure about 10 "
+                "points over the whole view of each camera, at the heights in use"
+            )

@@ -1,7 +1,9 @@
-"""Typed addresses of cameras: their faults, their names, and passwords with special characters."""
+"""The cameras that a lab can use: their names and pictures, and typed addresses."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
@@ -9,12 +11,95 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ipsys_log.app.first_day.camera_address import parse_camera_address
-from ipsys_log.app.first_day.camera_choice import add_camera
+from ipsys_log.app.first_day.camera_choice import (
+    add_camera,
+    list_options,
+    parse_camera_address,
+    propose_names,
+    take_picture,
+)
+from ipsys_log.capture.frames import Clock, Frame, Say
+from ipsys_log.capture.usb_bus import UsbCamera
 from ipsys_log.live_runs.survey.entry import Fault
 from ipsys_log.messages import Rig, RigCamera
 from ipsys_log.messages.rig_file import load_rig
 from ipsys_log.plain_text import hide_password
+
+
+def attached(device: Path, name: str, stable: str | None = None, fault: str | None = None) -> UsbCamera:
+    device.touch()
+    return UsbCamera(str(device), stable, name, None, (), fault)
+
+
+def test_options_without_a_rig_are_attached_and_simulated_cameras(tmp_path: Path) -> None:
+    first = attached(tmp_path / "video0", "Lab Camera", stable="/dev/v4l/by-id/lab")
+    second = attached(tmp_path / "video2", "Web Camera", fault="Permission denied")
+    options = list_options(None, [first, second])
+    assert [(option.key, option.text, option.name) for option in options[:2]] == [
+        ("usb:/dev/v4l/by-id/lab", "Lab Camera", ""),
+        (f"usb:{tmp_path / 'video2'}", "Web Camera; Permission denied", ""),
+    ]
+    assert {option.text for option in options[2:]} == {"simulated lab, without hardware"}
+
+
+def test_camera_of_the_rig_is_offered_once_also_under_another_path(tmp_path: Path) -> None:
+    device = attached(tmp_path / "video0", "Lab Camera")
+    (tmp_path / "by-id").symlink_to(tmp_path / "video0")
+    rig = Rig(
+        "lab",
+        "DICT_4X4_100",
+        0.2,
+        cameras=(
+            RigCamera("red", source=f"usb:{tmp_path / 'by-id'}"),
+            RigCamera("white", source="rtsp://admin:secret@10.0.0.7/live"),
+            RigCamera("black"),
+        ),
+    )
+    options = [option for option in list_options(rig, [device]) if not option.key.startswith("sim:")]
+    assert [(option.key, option.name) for option in options] == [
+        (f"usb:{tmp_path / 'by-id'}", "red"),
+        ("rtsp://admin:***@10.0.0.7/live", "white"),
+    ]
+
+
+def test_simulated_camera_in_use_is_not_offered_again() -> None:
+    rig = Rig("lab", "DICT_4X4_100", 0.2, cameras=(RigCamera("red", source="sim:red"),))
+    offered = [option.key for option in list_options(rig, [])]
+    assert offered.count("sim:red") == 1
+    assert "sim:white" in offered
+
+
+def test_each_camera_has_a_proposed_name_of_its_own(tmp_path: Path) -> None:
+    used = RigCamera("white", source="sim:black"), RigCamera("camera_1", source="rtsp://10.0.0.7/live")
+    rig = Rig("lab", "DICT_4X4_100", 0.2, cameras=(*used, RigCamera("door")))
+    devices = [attached(tmp_path / f"video{number}", "Lab Camera") for number in range(2)]
+    options = list_options(rig, devices)
+    assert dict(zip([option.key for option in options], propose_names(options, rig), strict=True)) == {
+        "sim:black": "white",
+        "rtsp://10.0.0.7/live": "camera_1",
+        f"usb:{tmp_path / 'video0'}": "door",
+        f"usb:{tmp_path / 'video1'}": "camera_2",
+        "sim:red": "red",
+        "sim:white": "camera_3",
+    }
+
+
+def test_picture_of_a_camera_is_its_first_image() -> None:
+    """A node may send markers only, whose bytes may look like a keyframe; waits come between frames."""
+    markers = Frame(bytes.fromhex("00000001 65 88"), "markers", None)
+    frames = [None, markers, Frame(b"image", "jpeg", None)]
+
+    @contextmanager
+    def open_frames(_camera: RigCamera, _clock: Clock, _say: Say) -> Iterator[Iterator[Frame | None]]:
+        yield iter(frames)
+
+    def take() -> bytes | None:
+        return take_picture(RigCamera("red"), open_frames, lambda text: None, lambda: False)
+
+    assert take() == b"image"
+    del frames[2]
+    assert take() is None
+
 
 RIG = Rig(
     "lab",

@@ -1,1 +1,0 @@
-"""The page of ``ipsys setup``: it serves the steps of the first day."""

@@ -1,0 +1,82 @@
+"""The streams of a command: their settings in a rig file, their check before any work, and their opening."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
+from dataclasses import fields
+from importlib import import_module
+from pathlib import Path
+from typing import Protocol
+
+from ipsys_log.capture.lab import OpenLab
+from ipsys_log.extras import check_installed
+from ipsys_log.messages import RigStream
+from ipsys_log.messages.channels import TRACKS
+from ipsys_log.sinks.sink import InlineSink
+from ipsys_log.sinks.streams import STREAMS, StreamSettings
+from ipsys_log.sinks.streams.poses import StreamContext, first_session
+
+
+class Stream(InlineSink, Protocol):
+    """A sink with open sockets that never waits; one with connections also has a ``client_count``."""
+
+    @property
+    def dropped_count(self) -> int:
+        """The number of messages that the stream lost."""
+
+    def describe(self) -> str:
+        """Return one line about the receivers of the positions."""
+
+    def close(self) -> None:
+        """Close the sockets."""
+
+
+def settings_of_rig(stream: RigStream | None, folder: Path) -> StreamSettings:
+    """Return the settings of a rig file; the path of its key is relative to the folder of the file."""
+    if stream is None:
+        return StreamSettings()
+    given = {field.name: getattr(stream, field.name) for field in fields(stream)}
+    given["key"] = None if stream.key is None else folder / stream.key
+    return StreamSettings(**{name: value for name, value in given.items() if value is not None})
+
+
+@contextmanager
+def open_streams(context: StreamContext) -> Iterator[list[Stream]]:
+    """Open streams; their sockets are closed after the block.
+
+    Raises
+    ------
+    IpsysError
+        An address, a port or the key has a fault.
+    """
+    with ExitStack() as stack:
+        streams: list[Stream] = []
+        for name in context.settings.wanted:
+            if STREAMS[name]:
+                check_installed(f"--{name} needs", *STREAMS[name])
+            module = import_module(f"ipsys_log.sinks.streams.{name}")
+            streams.extend(stack.enter_context(closing(stream)) for stream in module.open_all(context))
+        yield streams
+
+
+def open_live_streams(
+    settings: StreamSettings, lab: OpenLab, run: str
+) -> AbstractContextManager[list[Stream]]:
+    """Open streams of the tracks of a run, for the robots of an open lab."""
+    now_ns, heights_m = lab.cameras.clock.now_ns, lab.rig.robot_heights_m()
+    session = first_session(now_ns())
+    topics = {TRACKS.topic_of(run)}
+    return open_streams(StreamContext(settings, topics, now_ns, lab.cameras.add_event, session, heights_m))
+
+
+def check_streams(settings: StreamSettings) -> list[str]:
+    """Open all sockets and close them again; return a line for each stream about its receivers.
+
+    Raises
+    ------
+    IpsysError
+        The errors of :func:`open_streams`.
+    """
+    with open_streams(StreamContext(settings, (), lambda: 0, lambda kind, text: None, 0)) as streams:
+        return [stream.describe() for stream in streams]

@@ -60,10 +60,11 @@ _MOST_OUTLIERS = 0.2
 # A hypothesis about cameras must decrease twice the cost by this much: once in a million sessions by chance.
 _LEAST_GAIN = 60.0
 _MOST_HYPOTHESES = 3
-# If the best hypothesis leaves a larger share of outliers, the next one is tried instead of it,
-_FEW_OUTLIERS = 0.01
-# up to so many: each is a fit.
+# So many hypotheses are tried: each is a fit.
 _MOST_TRIALS = 2
+# If the first one leaves a smaller share of outliers, a second one of a smaller share of its evidence is not.
+_FEW_OUTLIERS = 0.01
+_MUCH_LESS = 0.5
 # Row times have fewer unknowns than a motion at any time: they come first if they explain this share of it.
 _ROWS_SHARE = 0.25
 # Two hypotheses are both possible if their probabilities differ by less than a factor of 100.
@@ -300,9 +301,11 @@ def _likely_causes(fit: JointFit) -> list[_Cause]:
 def _try_causes(
     fit: JointFit, causes: Sequence[_Cause], settings: JointSettings, progress: Progress
 ) -> JointFit | None:
-    """Return the fit with the first cause that explains everything, or else with that of least cost."""
-    trials = []
-    for _, motion in causes:
+    """Return the fit of least cost, without trials of causes that explain much less than one that fits."""
+    trials, most = [], 0.0
+    for chi2, motion in causes:
+        if chi2 < _MUCH_LESS * most:
+            break
         if motion is None:
             trial = _try_row_times(fit, settings, progress)
         else:
@@ -310,7 +313,7 @@ def _try_causes(
         if trial is not None and _gain(fit, trial) > _LEAST_GAIN - _AS_PROBABLE:
             trials.append(trial)
             if _outlier_share(trial) < _FEW_OUTLIERS:
-                break
+                most = np.inf if motion is None else chi2
     return min(trials, key=lambda one: one.solution.cost, default=None)
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import re
 import struct
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_type_hints
 
 _PREFIX = "ipsys"
 _HEADER = struct.Struct("<4s8sQqB")
@@ -163,14 +163,10 @@ def _read(data: bytes, kind: Any) -> dict[str, Any] | None:
         values = json.loads(data)
     except (ValueError, RecursionError):
         return None
-    types = {name: {"int": int, "str": str, "bool": bool}[text] for name, text in _types(kind).items()}
+    types = get_type_hints(kind)
     if not isinstance(values, dict) or values.keys() != types.keys():
         return None
     return values if all(_is_valid(name, value, types[name]) for name, value in values.items()) else None
-
-
-def _types(kind: Any) -> dict[str, str]:
-    return {name: getattr(hint, "__forward_arg__", hint) for name, hint in kind.__annotations__.items()}
 
 
 def _is_valid(name: str, value: Any, kind: type) -> bool:

@@ -1,4 +1,4 @@
-"""What a stage reads of a log: its channels in log order; settings of the user replace those of the log."""
+"""The input of a stage from a log: its channels in log order, with the settings of the user."""
 
 from __future__ import annotations
 

@@ -60,10 +60,11 @@ _MOST_OUTLIERS = 0.2
 # A hypothesis about cameras must decrease twice the cost by this much: once in a million sessions by chance.
 _LEAST_GAIN = 60.0
 _MOST_HYPOTHESES = 3
-# So many hypotheses are tried: each is a fit.
+# The number of hypotheses that are tried: each is a fit.
 _MOST_TRIALS = 2
-# If the first one leaves a smaller share of outliers, a second one of a smaller share of its evidence is not.
+# If the first one leaves a smaller share of outliers,
 _FEW_OUTLIERS = 0.01
+# the second one is tried only if it has at least this share of the evidence.
 _MUCH_LESS = 0.5
 # Row times have fewer unknowns than a motion at any time: they come first if they explain this share of it.
 _ROWS_SHARE = 0.25
@@ -92,7 +93,7 @@ def fit_hypotheses(
     """
     settings = settings or JointSettings()
     try:
-        fit = _fit_readings(observations, settings, progress)
+        return _fit_inputs(observations, settings, progress)
     except UnplacedError as error:
         rest = without_cameras(observations, error.cameras)
         if not rest.cameras:
@@ -101,36 +102,37 @@ def fit_hypotheses(
         left_out = [observations.cameras[camera].name for camera in error.cameras]
         known = [Finding("left_out", name, 0.0, f"{error}; it is left out") for name in left_out[:1]]
         return replace(fit, known=(*known, *fit.known))
-    return _explain_cameras(fit, settings, progress)
 
 
-def _fit_readings(observations: Observations, settings: JointSettings, progress: Progress) -> JointFit:
-    """Return the fit to the readings that agree; it names the others."""
-    fit, error = None, None
+def _fit_inputs(observations: Observations, settings: JointSettings, progress: Progress) -> JointFit:
+    """Return the fit to the inputs that agree; it names the others.
+
+    Cameras come first: a moved one spoils the shape of the points, which explains the readings.
+    """
+    explained, error = None, None
     try:
         placed = place_cameras(observations)
         if _agrees_roughly(observations, placed):
             fit = fit_jointly(observations, settings, progress, placed)
+            explained = _explain_cameras(fit, settings, progress)
+            if not _is_contradicted(fit) or not _is_contradicted(explained):
+                return explained
     except UnplacedError:
         raise
     except FitError as caught:
         error = caught
-    if fit is not None:
-        if not _is_contradicted(fit):
-            return fit
-        # A motion of a camera would spoil the shape of the points, which explains the readings.
-        moved = _explain_cameras(fit, settings, progress)
-        if not _is_contradicted(moved):
-            return moved
     explanations = _explain_tape(observations, settings, progress)
     if explanations and not explanations[0].changes:
         # The readings as they are need no other explanation.
         explanations = explanations[:1]
-    if explanations and (fit is None or len(explanations) > 1 or _left_out(explanations[0])):
-        return _fit_explained(observations, explanations, settings, progress)
-    if fit is None and error is not None:
+    if explanations and (explained is None or len(explanations) > 1 or _left_out(explanations[0])):
+        fit = _fit_explained(observations, explanations, settings, progress)
+        return _explain_cameras(fit, settings, progress)
+    if explained is not None:
+        return explained
+    if error is not None:
         raise error
-    return fit_jointly(observations, settings, progress) if fit is None else fit
+    return _explain_cameras(fit_jointly(observations, settings, progress), settings, progress)
 
 
 def _agrees_roughly(observations: Observations, placed: Sequence[PlacedCamera]) -> bool:

@@ -34,7 +34,8 @@ _POSE = 6
 _MOST_TURN_RAD = 0.17
 # A factor on the limits of the loss with which no residual is an outlier.
 _NO_LIMIT = 1e12
-# In simulated labs, true motions achieve at least twice what is promised, and single outliers 0.25 of it.
+# In simulated labs, true motions achieve at least 1.9 times the promised decrease; outliers at one instant
+# achieve at most 0.25 times.
 _ACHIEVED = 0.7
 # Rounding errors of a cost.
 _SAME_COST = 1e-9
@@ -71,9 +72,9 @@ class Squares:
 
 
 def explains_squares(fit: JointFit, divided: JointFit, motion: CameraMotion) -> bool:
-    """Return whether the fit with a motion has the decrease of the sum of squares that one step promised.
+    """Return whether a motion decreases the sum of squares by nearly as much as one step promised.
 
-    Outliers of other causes promise a motion, and remain after it.
+    Outliers of another cause also promise a decrease, but the fit with the motion does not remove them.
     """
     before, after = (2 * one.problem.cost(one.state, _NO_LIMIT) for one in (fit, divided))
     return before - after > _ACHIEVED * motion.chi2

@@ -103,10 +103,9 @@ class Problem:
         """Return the losses of readings above ``most``, and of moving outliers above their limit."""
         excess = self.points.excess_loss(state, self.layout, most)
         for factors in self.sightings:
-            if factors.kind is Kind.STATIONARY:
-                continue
-            chi2 = factors.chi2(state, self.layout, self.trajectories)
-            excess += float(np.maximum(robust_loss(chi2, factors.limit)[0] - factors.limit, 0).sum())
+            if factors.kind is not Kind.STATIONARY:
+                chi2 = factors.chi2(state, self.layout, self.trajectories)
+                excess += float(np.maximum(robust_loss(chi2, factors.limit)[0] - factors.limit, 0).sum())
         return excess
 
 

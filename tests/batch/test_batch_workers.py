@@ -89,14 +89,19 @@ def test_logs_have_the_bytes_of_the_single_command(tmp_path: Path, replayed: byt
     assert new.read_bytes() == replayed
 
 
-def test_killed_workers_cost_only_the_log_that_ends_them(tmp_path: Path, replayed: bytes) -> None:
-    """A kill -9 in the middle of a log is repeated; a log that ends four workers is named."""
-    names = ("0.mcap", DEADLY, HELD, "1.mcap", "2.mcap", "3.mcap")
-    logs = copies(tmp_path / "logs", *names)
-    notes = tmp_path / "notes"
+def test_killed_worker_costs_no_log(tmp_path: Path, replayed: bytes) -> None:
+    """A log whose worker ends by kill -9 in its middle is repeated."""
+    logs = copies(tmp_path / "logs", "0.mcap", HELD, "1.mcap")
+    with one_worker_killed(tmp_path / "notes"):
+        results = drive(logs, tmp_path / "notes", workers=2)
+    assert [name for name, result in results.items() if not result["good"]] == []
+    assert [log.name for log in logs if log.read_bytes() != replayed] == []
 
-    with one_worker_killed(notes):
-        results = drive(logs, notes, workers=2)
+
+def test_log_that_ends_all_its_workers_is_named(tmp_path: Path, replayed: bytes) -> None:
+    logs = copies(tmp_path / "logs", "0.mcap", DEADLY, "1.mcap", "2.mcap")
+    notes = tmp_path / "notes"
+    results = drive(logs, notes, workers=2)
     assert {name for name, result in results.items() if not result["good"]} == {DEADLY}
     assert f"its worker ended {MOST_ENDED_WORKERS} times" in results[DEADLY]["text"]
     # A worker can end while a log waits for it.

@@ -149,6 +149,15 @@ def test_turn_that_spoils_the_shape_of_the_points_is_found() -> None:
     assert kinds(fit_hypotheses(observations)) == [("camera", "white")]
 
 
+@pytest.mark.parametrize("seed", [538, 539])
+def test_wobble_beyond_its_sigma_accuses_no_camera(seed: int) -> None:
+    lab = LabSettings(seed=seed, rate_hz=10.0, drive_s=60.0, markers=2)
+    errors = GeometricSettings(
+        lab=lab, points=8, wobble_deg=0.6, marker_scale_sigma=0.002, robot_height_sigma_m=0.001
+    )
+    assert kinds(fit_hypotheses(observe(build_lab(errors)))) == []
+
+
 @pytest.mark.parametrize("share", [0.1, 0.95])
 def test_outliers_at_one_instant_accuse_no_camera(share: float) -> None:
     """A robot that turns back at once is not where its path is."""

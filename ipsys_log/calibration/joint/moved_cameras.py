@@ -25,9 +25,11 @@ _SEARCHES = 3
 _LEAST = 10
 # A sighting of a stationary marker counts as so many.
 _STATIONARY = 5
-# A camera without motion exceeds this chi2, with six degrees of freedom, once in a million sessions. Right
-# row times exceed it less often: they have one degree of freedom for each camera.
-_CONTRADICTED = 60.0
+# A motion or wrong row times need a larger chi2. In 59 honest simulated labs with a wobble of 0.6 degrees,
+# 2.6 times its sigma, the largest one is 69,
+_CONTRADICTED = 80.0
+# but 118 if only a few sightings of moving markers, which share a few tilts, are on one side of the time.
+_FEW, _CONTRADICTED_BY_FEW = 40, 200.0
 # Unknowns of a pose: a turn and a shift.
 _POSE = 6
 # A larger turn is that of a few outliers, which any pose explains.
@@ -114,7 +116,10 @@ def find_motion(squares: Squares, camera: int) -> CameraMotion | None:
             return None
         cuts = _near(times_s, cuts, best.time_s)
         best = _best_motion(squares, camera, times_s, cuts)
-    return best if best.turn_rad < _MOST_TURN_RAD else None
+    is_later = times_s > best.time_s
+    has_few = any(len(side) < _FEW and side.max() == 1 for side in (worths[is_later], worths[~is_later]))
+    is_shown = best.chi2 > (_CONTRADICTED_BY_FEW if has_few else _CONTRADICTED)
+    return best if is_shown and best.turn_rad < _MOST_TURN_RAD else None
 
 
 def row_time_evidence(squares: Squares) -> float:

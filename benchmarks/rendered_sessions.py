@@ -29,6 +29,7 @@ from ipsys_log.vision.markers import MovingMarker, PlacedMarker
 from tests.geometric.lab import GeometricLab
 from tests.geometric.session import simulate_session
 from tests.geometric.sightings import start_ns, still_times_ns
+from tests.geometric.stops import PacedDrive
 
 __all__ = ["rendered_session"]
 
@@ -58,7 +59,8 @@ def rendered_session(lab: GeometricLab, folder: Path) -> list[Message]:
 
 
 def _key(lab: GeometricLab) -> str:
-    paces = {robot: (one.times_s.tolist(), one.shares.tolist()) for robot, one in lab.drive.paces.items()}
+    drive_paces = lab.drive.paces if isinstance(lab.drive, PacedDrive) else {}
+    paces = {robot: (one.times_s.tolist(), one.shares.tolist()) for robot, one in drive_paces.items()}
     return simulator_key(f"{lab.settings} {lab.drive.path} {paces} {dict(STAGE.versions)}")
 
 

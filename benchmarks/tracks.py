@@ -44,8 +44,8 @@ from track_errors import (
 )
 
 from ipsys_log.calibration.joint.payload import JOINT
-from ipsys_log.capture.simulation.drive import Stops
 from ipsys_log.errors import FitError
+from tests.geometric.stops import Stops
 
 __all__ = ["measure"]
 

@@ -25,6 +25,7 @@ from ipsys_log.messages import CameraCalibration, CompressedImage, Measurement, 
 from ipsys_log.messages.rig_file import check_rig
 from ipsys_log.vision.markers import PlacedMarker, project_corners
 from ipsys_log.vision.trilateration import trilaterate
+from tests.geometric.stops import poses_over, velocities_over
 
 SMALL = LabSettings(width=640, height=360, stations=4, frames_per_station=2, drive_s=0.5, rate_hz=10.0)
 
@@ -247,8 +248,8 @@ def test_velocity_of_a_drive_is_the_slope_of_its_path(speed_m_s: float) -> None:
     # The times include the acceleration at the start and a second lap of the path.
     times_s = np.linspace(0.01, 1.2 * drive.times_s[-1], 500)
     for marker_id in drive.ahead_s:
-        after, before = (drive.poses_over(marker_id, times_s + side * step_s / 2) for side in (1, -1))
+        after, before = (poses_over(drive, marker_id, times_s + side * step_s / 2) for side in (1, -1))
         slopes_m_s = (after - before)[:, :2] / step_s
-        velocities_m_s = drive.velocities_over(marker_id, times_s)
+        velocities_m_s = velocities_over(drive, marker_id, times_s)
         assert np.abs(velocities_m_s - slopes_m_s).max() < 1e-3 * speed_m_s
-    assert drive.velocities_over(0, np.array([-1.0, 0.0])).tolist() == [[0.0, 0.0], [0.0, 0.0]]
+    assert velocities_over(drive, 0, np.array([-1.0, 0.0])).tolist() == [[0.0, 0.0], [0.0, 0.0]]

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
 
 from ipsys_log.capture.simulation.cameras import mount_cameras
-from ipsys_log.capture.simulation.drive import Stops, draw_pace, plan_drive
+from ipsys_log.capture.simulation.drive import plan_drive
 from ipsys_log.capture.simulation.settings import LabSettings
+from tests.geometric.stops import Stops, draw_pace, pace_drive, poses_over, velocities_over
 
 STOPS = Stops(legs_s=2.0, stands_s=1.0, acceleration_m_s2=2.5)
 
@@ -30,14 +29,14 @@ def test_way_of_a_pace_is_the_integral_of_its_speed() -> None:
 def test_robot_with_stops_brakes_with_its_acceleration() -> None:
     lab = LabSettings(drive_s=20.0, drive_speed_m_s=0.26, markers=2)
     steady = plan_drive(lab, mount_cameras(lab))
-    drive = replace(steady, paces={0: draw_pace(STOPS, 0.26, 20.0, np.random.default_rng(2))})
+    drive = pace_drive(steady, {0: draw_pace(STOPS, 0.26, 20.0, np.random.default_rng(2))})
     times_s = np.arange(2.0, 20.0, 0.01)
-    velocities_m_s = drive.velocities_over(0, times_s)
-    points_m = drive.poses_over(0, times_s)[:, :2]
+    velocities_m_s = velocities_over(drive, 0, times_s)
+    points_m = poses_over(drive, 0, times_s)[:, :2]
     moved_m = np.diff(points_m, axis=0)
     np.testing.assert_allclose(moved_m / 0.01, (velocities_m_s[1:] + velocities_m_s[:-1]) / 2, atol=0.02)
     speeds_m_s = np.linalg.norm(velocities_m_s, axis=1)
     assert speeds_m_s.min() == 0.0
     assert 2.2 < np.abs(np.diff(speeds_m_s)).max() / 0.01 < 2.6
     # The other robot drives on.
-    np.testing.assert_array_equal(drive.poses_over(1, times_s), steady.poses_over(1, times_s))
+    np.testing.assert_array_equal(poses_over(drive, 1, times_s), poses_over(steady, 1, times_s))

@@ -60,13 +60,17 @@ def mount_cameras(settings: LabSettings, time_ns: int = 0) -> tuple[Camera, ...]
             _mount(settings, index, middle_m, _cell_of_floor(settings, middle_m), time_ns)
             for index, middle_m in enumerate(_grid_middles(*settings.grid, settings.spacing_m))
         )
-    count = len(settings.cameras)
-    spacing_m = (FLOOR_M - 2 * _FROM_WALL_M) / max(count - 1, 2)
-    ys_m = FLOOR_M / 2 + spacing_m * (np.arange(count) - (count - 1) / 2)
+    ys_m, spacing_m = row_of_cameras(len(settings.cameras))
     return tuple(
         _mount(settings, index, (FLOOR_M / 2, y_m), _part_of_floor(settings, y_m, spacing_m), time_ns)
         for index, y_m in enumerate(ys_m.tolist())
     )
+
+
+def row_of_cameras(count: int) -> tuple[Array, float]:
+    """Return the y of cameras in a row above the floor, (count,), and the distance of two of them, in m."""
+    spacing_m = (FLOOR_M - 2 * _FROM_WALL_M) / max(count - 1, 2)
+    return FLOOR_M / 2 + spacing_m * (np.arange(count) - (count - 1) / 2), spacing_m
 
 
 def _grid_middles(columns: int, rows: int, spacing_m: tuple[float, float]) -> list[tuple[float, float]]:
@@ -76,23 +80,6 @@ def _grid_middles(columns: int, rows: int, spacing_m: tuple[float, float]) -> li
         for column in range(columns)
         for row in range(rows)
     ]
-
-
-def aim_cameras(settings: LabSettings, time_ns: int = 0) -> tuple[Camera, ...]:
-    """Return cameras with large tilts, each aimed at the point of the floor below its place in the row.
-
-    A camera with a tilt of t stands ``height * tan(t)`` beside its place, at most at the walls.
-    :func:`mount_cameras` refuses such tilts, because a tilted camera does not see its part of the floor.
-
-    Parameters
-    ----------
-    settings : settings of the lab.
-    time_ns : time of the calibrations.
-    """
-    count = len(settings.cameras)
-    spacing_m = (FLOOR_M - 2 * _FROM_WALL_M) / max(count - 1, 2)
-    ys_m = FLOOR_M / 2 + spacing_m * (np.arange(count) - (count - 1) / 2)
-    return tuple(_aim(settings, index, float(y_m), time_ns) for index, y_m in enumerate(ys_m))
 
 
 def sees(camera: Camera, points_m: Array) -> NDArray[np.bool_]:
@@ -113,37 +100,20 @@ def _mount(
     rng = random_stream(settings.seed, Purpose.CAMERA, index)
     name = settings.cameras[index]
     for _ in range(_TRIES):
-        lens = _draw_lens(rng, settings, name, time_ns)
+        lens = draw_lens(rng, settings, name, time_ns)
         tilt = np.radians(rng.uniform(*settings.tilt_deg))
         towards = rng.uniform(0, 2 * np.pi)
         tilt_rad = tilt * np.array([np.cos(towards), np.sin(towards), 0.0])
         nudge_m = rng.uniform(-1, 1, 3) * [0.02, 0.02, 0.04]
         origin_m = np.array([*place_m, settings.mount_height_m]) + nudge_m
         camera = Camera(name, lens, look_down(origin_m, tilt_rad))
-        if _reaches(lens) and sees(camera, wanted_m).all():
+        if reaches(lens) and sees(camera, wanted_m).all():
             return camera
     raise IpsysError(
         f"simulator: camera {name!r} cannot see its part of the floor from {settings.mount_height_m:g} m "
         f"with a tilt of {settings.tilt_deg[0]:g} to {settings.tilt_deg[1]:g} degrees; "
         "tilt it less, hang it higher, or use a frame of 16:9 and lower markers"
     )
-
-
-def _aim(settings: LabSettings, index: int, y_m: float, time_ns: int) -> Camera:
-    rng = random_stream(settings.seed, Purpose.GEOMETRY, index)
-    name = settings.cameras[index]
-    for _ in range(_TRIES):
-        lens = _draw_lens(rng, settings, name, time_ns)
-        if _reaches(lens):
-            break
-    tilt = np.radians(rng.uniform(*settings.tilt_deg))
-    towards = rng.uniform(0, 2 * np.pi)
-    axis = np.array([np.cos(towards), np.sin(towards), 0.0])
-    aside = look_down(np.zeros(3), tilt * axis)[2, :3]
-    place_m = np.array([FLOOR_M / 2, y_m]) + settings.mount_height_m * aside[:2] / aside[2]
-    nudge_m = rng.uniform(-1, 1, 3) * [0.02, 0.02, 0.04]
-    origin_m = np.append(np.clip(place_m, 0.0, FLOOR_M), settings.mount_height_m) + nudge_m
-    return Camera(name, lens, look_down(origin_m, tilt * axis))
 
 
 def _part_of_floor(settings: LabSettings, y_m: float, spacing_m: float) -> Array:
@@ -179,7 +149,8 @@ def _cell_of_floor(settings: LabSettings, middle_m: tuple[float, float]) -> Arra
     return np.column_stack([flat_m, np.full(len(flat_m), top_m)])
 
 
-def _draw_lens(rng: np.random.Generator, settings: LabSettings, name: str, time_ns: int) -> CameraCalibration:
+def draw_lens(rng: np.random.Generator, settings: LabSettings, name: str, time_ns: int) -> CameraCalibration:
+    """Draw the intrinsics of a camera; their distortion is about that of the lenses in the paper."""
     scale = settings.width / 1920
     fx = scale * rng.uniform(*_FOCAL_PX)
     fy = fx * rng.uniform(0.998, 1.002)
@@ -194,7 +165,7 @@ def _draw_lens(rng: np.random.Generator, settings: LabSettings, name: str, time_
     )
 
 
-def _reaches(lens: CameraCalibration) -> bool:
+def reaches(lens: CameraCalibration) -> bool:
     """Return whether the lens distortion is monotone up to an angle outside the image."""
     theta = np.linspace(0, _WIDEST_RAD, 200)
     powers = theta[:, None] ** np.array([2, 4, 6, 8])

@@ -117,30 +117,6 @@ def build_rig(settings: LabSettings) -> Rig:
     )
 
 
-def drive_start_ns(settings: LabSettings, cameras: Sequence[Camera]) -> int:
-    """Return the start time of the robots.
-
-    The true poses at a time are ``drive.places_at`` of the seconds since this start.
-
-    Parameters
-    ----------
-    settings : settings of the lab.
-    cameras : from :func:`~ipsys_log.capture.simulation.cameras.mount_cameras`.
-
-    Returns
-    -------
-    The time of the first frame of the drive, in ns.
-
-    Examples
-    --------
-    >>> lab = LabSettings(stations=0, drive_s=2.0, markers=1)
-    >>> cameras = mount_cameras(lab)
-    >>> (drive_start_ns(lab, cameras) - EPOCH_NS) / NS_PER_S
-    1.0
-    """
-    return _start_ns(settings, len(plan_points(settings, cameras)))
-
-
 def _payloads(
     settings: LabSettings, progress: Callable[[str, int, int], None]
 ) -> Iterator[tuple[str, Any, int, str | None]]:
@@ -186,7 +162,7 @@ def _instants(settings: LabSettings, cameras: Sequence[Camera]) -> Iterator[Inst
     for number, points in enumerate(sets):
         places = tuple(point.pose for point in points)
         lying = tuple(place_marker(pose, settings) for pose in places)
-        times_ns = _times(settings, _start_ns(settings, number), settings.frames_per_station)
+        times_ns = _times(settings, start_of_set_ns(settings, number), settings.frames_per_station)
         first = number * settings.markers
         measured = tuple(
             measure(pose, settings, index, times_ns, splits[index])
@@ -195,7 +171,7 @@ def _instants(settings: LabSettings, cameras: Sequence[Camera]) -> Iterator[Inst
         for time_ns in times_ns[:-1]:
             yield Instant(time_ns, places, lying)
         yield Instant(times_ns[-1], places, lying, measured)
-    drive, start_ns = plan_drive(settings, cameras), _start_ns(settings, len(sets))
+    drive, start_ns = plan_drive(settings, cameras), start_of_set_ns(settings, len(sets))
     for time_ns in _times(settings, start_ns, round(settings.drive_s * settings.rate_hz)):
         time_s = (time_ns - start_ns) / NS_PER_S
         prints = tuple(moving_marker(drive, marker_id, time_s, settings) for marker_id in drive.ahead_s)
@@ -207,7 +183,7 @@ def moving_marker(drive: Drive, marker_id: int, time_s: float, settings: LabSett
     return lambda since_s: place_marker(drive.pose_at(marker_id, time_s + since_s), settings)
 
 
-def _start_ns(settings: LabSettings, number: int) -> int:
+def start_of_set_ns(settings: LabSettings, number: int) -> int:
     """Return the first time of a set of calibration points; after the last set, the start of the drive."""
     last_ns = _times(settings, 0, settings.frames_per_station)[-1]
     return EPOCH_NS + NS_PER_S + number * (last_ns + _PAUSE_NS)

@@ -25,7 +25,6 @@ _LAST_S = 1.0
 
 # The function is called with None when the earlier data are on the disk, or with the error of the disk.
 Confirm = Callable[[OSError | None], None]
-# Linux names the present path of each open file here; other systems do not.
 
 
 class Syncer:

@@ -30,10 +30,11 @@ from ipsys_log.stages.detect import usual_corners
 class LivePlan(NamedTuple):
     """The plan of a live run.
 
-    It has the completed request, and the models of another log with the tasks that copy them. It also has the
-    runs in the order of their records, and the causal stages.
+    It has the rig, the completed request, and the models of another log with the tasks that copy them. It
+    also has the runs in the order of their records, and the causal stages.
     """
 
+    rig: Rig
     request: Request
     copied: list[tuple[Task, Model]]
     runs: list[LiveRun]
@@ -114,7 +115,7 @@ def plan_live(
     models = [model for _, model in copied]
     _check(rig, cameras, lenses, models, until)
     wired = _wire(pictured, settings, lenses, request, copied, until, arriving)
-    return LivePlan(request, copied, *wired)
+    return LivePlan(rig, request, copied, *wired)
 
 
 def check_start(

@@ -66,29 +66,6 @@ class CameraSource(Source, Protocol):
     def now_ns(self) -> int: ...
 
 
-class Target(Protocol):
-    """Destination of messages, in the order of their log times.
-
-    ``full`` is set if the disk is full, ``fault`` if it failed to keep written messages. ``is_deleted`` is
-    True if another program has deleted the file.
-    """
-
-    @property
-    def is_deleted(self) -> bool: ...
-
-    @property
-    def full(self) -> WriteError | None: ...
-
-    @property
-    def fault(self) -> OSError | None: ...
-
-    def put(self, message: Message) -> None: ...
-
-    def flush(self) -> None: ...
-
-    def sync(self, confirm: Confirm) -> None: ...
-
-
 class Recording:
     """A log that several threads write; :func:`open_recording` creates it.
 
@@ -206,13 +183,16 @@ class Recording:
             self._torn = False
 
 
-def write_each(source: Source, log: Target) -> Iterator[Message]:
-    """Yield the messages of a source, each after it was written.
+def write_each(
+    source: Source, log: Recording, put: Callable[[Message], None] | None = None
+) -> Iterator[Message]:
+    """Yield the messages of a source, each after it was written, or after ``put`` has taken it.
 
     A measurement is confirmed as soon as it is on the disk. When the disk is full, or another program has
     deleted the log, the source is stopped.
     Messages other than frames are still written, to the reserved space.
     """
+    put = put or log.put
     warned, ticks = False, 0
     with closing(iter(source)) as messages:
         for message in messages:
@@ -226,7 +206,7 @@ def write_each(source: Source, log: Target) -> Iterator[Message]:
                 if ticks % _QUIET_TICKS == 0:
                     log.flush()
             elif log.full is None or not isinstance(message.payload, (CompressedImage, CompressedVideo)):
-                log.put(message)
+                put(message)
                 if isinstance(message.payload, Event) and message.payload.kind == STAMP_UNRELIABLE:
                     log.flush()  # the file never has the affected frames without this event
                 if isinstance(message.payload, Measurement):

@@ -36,7 +36,7 @@ from pathlib import Path
 
 from ipsys_log.capture.backlog import Backlog, RecentFrames
 from ipsys_log.capture.frames import SourceError
-from ipsys_log.capture.live_check import KnockEvents
+from ipsys_log.capture.live_check import knock_events
 from ipsys_log.capture.live_plan import check_independent_frames, plan_live
 from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.capture.recorder import CameraSource, Recording, open_recording, write_each
@@ -179,7 +179,7 @@ def measure(
         one_blas_thread(),
         open_recording(target, settings, overwrite) as log,
         RecentFrames(log) as recent,
-        Backlog(cameras, recent, cameras.now_ns) as frames,
+        Backlog(cameras, log, cameras.now_ns, recent.put) as frames,
     ):
         for message in _through(plan.stages, chain(settings, frames)):
             _show_all(show, *frames.take_events(), message)
@@ -223,8 +223,9 @@ def live(
     """
     plan = plan_live(cameras.states, settings, request, until)
     first = (*settings, *plan.copies(cameras.now_ns))
+    knocks = knock_events(plan.rig, cameras.add_event)
     with (
-        FanOut([KnockEvents(cameras), _contradictions(cameras.say), *sinks], cameras.add_event) as show,
+        FanOut([knocks, _contradictions(cameras.say), *sinks], cameras.add_event) as show,
         one_blas_thread(),
         open_recording(target, first, overwrite) as log,
         ExitStack() as resources,

@@ -70,7 +70,8 @@ def mount_cameras(settings: LabSettings, time_ns: int = 0) -> tuple[Camera, ...]
 def row_of_cameras(count: int) -> tuple[Array, float]:
     """Return the y of cameras in a row above the floor, (count,), and the distance of two of them, in m."""
     spacing_m = (FLOOR_M - 2 * _FROM_WALL_M) / max(count - 1, 2)
-    return FLOOR_M / 2 + spacing_m * (np.arange(count) - (count - 1) / 2), spacing_m
+    ys_m: Array = FLOOR_M / 2 + spacing_m * (np.arange(count) - (count - 1) / 2)
+    return ys_m, spacing_m
 
 
 def _grid_middles(columns: int, rows: int, spacing_m: tuple[float, float]) -> list[tuple[float, float]]:

@@ -66,7 +66,7 @@ class Ros2Stream:
         self.port, self._host, self._domain = port, host or LOOPBACK, domain
         self.name = f"ROS 2 domain {domain}"
         self._poses, self._now_ns, self._clock = poses, now_ns, Clock()
-        self._drops = DropReport(self.name, warn)
+        self.drops = DropReport(self.name, warn)
         self._newest: dict[str, StreamPose | None] = dict.fromkeys(heights_m)
         self._number = 0
         self._ended = threading.Event()
@@ -89,14 +89,9 @@ class Ros2Stream:
             return f"{name}: only this machine"
         return f"{name}: every computer that reaches {self._host} can read the positions"
 
-    @property
-    def dropped_count(self) -> int:
-        """The number of messages that the stream lost."""
-        return self._drops.count
-
     def close(self) -> None:
         """Close the session: a program that ends without this can hang."""
-        self._drops.finish()
+        self.drops.finish()
         self._ended.set()
         self._thread.join()
         self._close_session()
@@ -155,7 +150,7 @@ class Ros2Stream:
         try:
             publisher.put(data, self._clock.now_ns())
         except zenoh.ZError as error:
-            self._drops.add(str(error))
+            self.drops.add(str(error))
 
     def _send_clock(self) -> None:
         now_ns = self._now_ns()

@@ -6,7 +6,6 @@ import threading
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from types import TracebackType
 
 from ipsys_log.capture.recorder import Recording, Source, write_each
 from ipsys_log.errors import WriteError
@@ -150,9 +149,7 @@ class Backlog:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         self._source.stop()
         self._thread.join(_LAST_S if isinstance(error, KeyboardInterrupt) else None)
 
@@ -244,9 +241,7 @@ class RecentFrames:
     def __enter__(self) -> RecentFrames:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         if not isinstance(error, (WriteError, KeyboardInterrupt)):
             self._write()
 

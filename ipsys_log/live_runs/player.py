@@ -8,7 +8,6 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing
 from itertools import chain
-from types import TracebackType
 from typing import TYPE_CHECKING, NamedTuple
 
 from ipsys_log.capture.frames import Clock
@@ -83,9 +82,7 @@ class Tracker:
             raise self._fault
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         self.stop()
         self._thread.join()
         if self._fault is not None and error is None:
@@ -212,9 +209,7 @@ class Player(Playback):
         self._tracker.__enter__()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         with self._stack:
             self._tracker.__exit__(kind, error, trace)
 

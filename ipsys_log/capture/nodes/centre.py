@@ -14,7 +14,6 @@ from contextlib import contextmanager
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 from ipsys_log.capture.frames import Clock, Frame, Say, SourceError, SourceMessage
@@ -150,9 +149,7 @@ class Centre:
         self._session = open_centre_session(self._network, list(self._nodes.values()))
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._session is not None:
             self._session.close()  # type: ignore[no-untyped-call]
 

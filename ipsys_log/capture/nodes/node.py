@@ -5,7 +5,6 @@ import threading
 from collections import OrderedDict, deque
 from pathlib import Path
 from queue import Empty, Full, Queue
-from types import TracebackType
 from typing import Any, NamedTuple, Self
 
 from ipsys_log.capture.frames import Clock, Say
@@ -131,9 +130,7 @@ class Node:
             )
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._stopped.set()
         with self._changed:
             self._changed.notify_all()

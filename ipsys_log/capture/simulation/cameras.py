@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.capture.simulation.settings import FLOOR_M, LabSettings, Purpose, random_stream
+from ipsys_log.capture.simulation.settings import FLOOR_M, HALL_SPACING_M, LabSettings, Purpose, random_stream
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Array, CameraCalibration
 from ipsys_log.vision.lenses import project, undistort
@@ -58,7 +58,7 @@ def mount_cameras(settings: LabSettings, time_ns: int = 0) -> tuple[Camera, ...]
     if settings.grid is not None:
         return tuple(
             _mount(settings, index, middle_m, _cell_of_floor(settings, middle_m), time_ns)
-            for index, middle_m in enumerate(_grid_middles(*settings.grid, settings.spacing_m))
+            for index, middle_m in enumerate(_grid_middles(*settings.grid))
         )
     ys_m, spacing_m = row_of_cameras(len(settings.cameras))
     return tuple(
@@ -74,10 +74,10 @@ def row_of_cameras(count: int) -> tuple[Array, float]:
     return ys_m, spacing_m
 
 
-def _grid_middles(columns: int, rows: int, spacing_m: tuple[float, float]) -> list[tuple[float, float]]:
+def _grid_middles(columns: int, rows: int) -> list[tuple[float, float]]:
     """Return the middles of the parts of the floor, column after column, in m."""
     return [
-        ((column + 0.5) * spacing_m[0], (row + 0.5) * spacing_m[1])
+        ((column + 0.5) * HALL_SPACING_M[0], (row + 0.5) * HALL_SPACING_M[1])
         for column in range(columns)
         for row in range(rows)
     ]
@@ -143,7 +143,7 @@ def _cell_of_floor(settings: LabSettings, middle_m: tuple[float, float]) -> Arra
     """
     top_m = max(*settings.heights_m, settings.drive_height_m)
     beyond_m = settings.marker_length_m / np.sqrt(2) + _BEYOND_M
-    reach_m = np.array(settings.spacing_m) / 2 + beyond_m
+    reach_m = np.array(HALL_SPACING_M) / 2 + beyond_m
     share = np.linspace(-1, 1, 9)
     edge = np.array([(x, y) for x in share for y in share if max(abs(x), abs(y)) == 1])
     flat_m = np.clip(middle_m + edge * reach_m, 0.0, settings.floor_m)

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from ipsys_log.capture.simulation.calibration_points import (
@@ -117,6 +118,14 @@ def build_rig(settings: LabSettings) -> Rig:
     )
 
 
+def live_cameras(settings: LabSettings) -> tuple[RigCamera, ...]:
+    """Return the cameras of the lab for a rig file, each with its source."""
+    return tuple(
+        RigCamera(name, None, None, f"sim:{name}", settings.width, settings.height, settings.rate_hz)
+        for name in settings.cameras
+    )
+
+
 def _payloads(
     settings: LabSettings, progress: Callable[[str, int, int], None]
 ) -> Iterator[tuple[str, Any, int, str | None]]:
@@ -134,26 +143,22 @@ def _payloads(
         instants = list(_instants(settings, cameras))
         for index, instant in enumerate(instants):
             progress("simulate", index * len(views), len(instants) * len(views))
-            yield TRUTH_TOPIC, _truth(instant, rig, cameras, settings), instant.time_ns, None
-            for image in pool.map(_Shutter(settings, instant, index), range(len(views)), views):
+            truth = true_tracks(instant.time_ns, instant.places, rig.robot_of, cameras, settings)
+            yield TRUTH_TOPIC, truth, instant.time_ns, None
+            for image in pool.map(partial(_photograph, settings, instant, index), range(len(views)), views):
                 yield image_topic(image.frame_id), image, instant.time_ns, image.frame_id
             for measurement in instant.measured:
                 yield MEASUREMENTS_TOPIC, measurement, measurement.timestamp, None
         progress("simulate", len(instants) * len(views), len(instants) * len(views))
 
 
-@dataclass(frozen=True, slots=True)
-class _Shutter:
-    """The renderer of the frames of an instant; the frames do not depend on the threads."""
-
-    settings: LabSettings
-    instant: Instant
-    index: int
-
-    def __call__(self, number: int, view: FloorView) -> CompressedImage:
-        rng = random_stream(self.settings.seed, Purpose.FRAME, number, self.index)
-        data = encode_jpeg(render(view, self.instant.prints, self.settings, rng), self.settings)
-        return CompressedImage(self.instant.time_ns, view.camera.name, data, "jpeg")
+def _photograph(
+    settings: LabSettings, instant: Instant, index: int, number: int, view: FloorView
+) -> CompressedImage:
+    """Render the frame of a camera at an instant; it does not depend on the threads."""
+    rng = random_stream(settings.seed, Purpose.FRAME, number, index)
+    data = encode_jpeg(render(view, instant.prints, settings, rng), settings)
+    return CompressedImage(instant.time_ns, view.camera.name, data, "jpeg")
 
 
 def _instants(settings: LabSettings, cameras: Sequence[Camera]) -> Iterator[Instant]:
@@ -193,12 +198,19 @@ def _times(settings: LabSettings, start_ns: int, count: int) -> list[int]:
     return [start_ns + round(index * NS_PER_S / settings.rate_hz) for index in range(count)]
 
 
-def _truth(instant: Instant, rig: Rig, cameras: Sequence[Camera], settings: LabSettings) -> Tracks:
+def true_tracks(
+    time_ns: int,
+    places: Sequence[SimulatedPose],
+    robot_of: Callable[[int], str],
+    cameras: Sequence[Camera],
+    settings: LabSettings,
+) -> Tracks:
+    """Return the ground truth of markers at an instant; ``robot_of`` returns the robot of a marker."""
     return Tracks(
-        instant.time_ns,
+        time_ns,
         tuple(
             Track(
-                robot=rig.robot_of(pose.marker_id),
+                robot=robot_of(pose.marker_id),
                 id=pose.marker_id,
                 x_m=pose.x_m,
                 y_m=pose.y_m,
@@ -206,6 +218,6 @@ def _truth(instant: Instant, rig: Rig, cameras: Sequence[Camera], settings: LabS
                 heading_rad=pose.heading_rad,
                 cameras=cameras_seeing(pose, cameras, settings),
             )
-            for pose in instant.places
+            for pose in places
         ),
     )

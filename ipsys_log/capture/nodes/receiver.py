@@ -46,13 +46,6 @@ class _Setup(NamedTuple):
     version: str
 
 
-class _Opening(NamedTuple):
-    """The request to open the camera of a node; the clock is that of the recording."""
-
-    camera: str
-    clock: Clock
-
-
 class Receiver:
     """The cameras of nodes, received in a process of its own. A context manager.
 
@@ -116,7 +109,7 @@ class Receiver:
     def _items(self, camera: RigCamera, clock: Clock, say: Say) -> Iterator[Frame | SourceMessage | None]:
         arrived, has_answered = self._arrived[camera.name], False
         arrived.clear()
-        self._send(_Opening(camera.name, clock))
+        self._send(camera.name, clock)
         while True:
             if not arrived:
                 self._look()
@@ -149,8 +142,8 @@ class Receiver:
         except (EOFError, OSError):
             self._fail()
 
-    def _send(self, opening: _Opening) -> None:
-        """Send a request to the process, and start it again if it has ended."""
+    def _send(self, camera: str, clock: Clock) -> None:
+        """Request a camera of the process, and start the process again if it has ended."""
         if self._process is None:
             try:
                 self._start()
@@ -158,7 +151,7 @@ class Receiver:
                 raise SourceError(str(error)) from error
         assert self._process is not None
         try:
-            self._process.sender.send(opening)
+            self._process.sender.send((camera, clock))
         except OSError:
             self._fail()
 

@@ -7,13 +7,12 @@ equal logs.
 from __future__ import annotations
 
 import threading
-import time
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Generator, Iterator
 from contextlib import contextmanager, suppress
 from types import NoneType
 
-from ipsys_log.capture.frames import CameraState, Clock, Frame, Open, Say, SourceError
+from ipsys_log.capture.frames import CameraState, Clock, Frame, Open, Say, SourceError, sleep_until
 from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.capture.simulated import FrameTiming
 from ipsys_log.capture.simulation.lab import EPOCH_NS
@@ -35,8 +34,6 @@ from ipsys_log.messages import (
 )
 from ipsys_log.sinks.streams.poses import PoseSource
 from ipsys_log.units import NS_PER_S
-
-_REAL_TURN_S = 0.4
 
 
 class RobotCameras:
@@ -73,10 +70,7 @@ class RobotCameras:
         while True:
             frame = max(frame + 1, timing.frame_at(clock.now_ns()))
             time_ns = round(frame * timing.period_ns)
-            while (left_s := (time_ns + timing.behind_ns - clock.now_ns()) / NS_PER_S) > 0:
-                time.sleep(min(left_s, _REAL_TURN_S))
-                if left_s > _REAL_TURN_S:
-                    yield None
+            yield from sleep_until(time_ns + timing.behind_ns, clock)
             if self._fails(name, time_ns):
                 if not was_lost:
                     raise SourceError(f"camera {name}: simulated failure")

@@ -2,7 +2,8 @@
 
 import heapq
 import math
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Generic, NamedTuple, TypeVar
 
@@ -52,6 +53,19 @@ class Plot(NamedTuple):
 
     title: str
     series: int
+
+
+@contextmanager
+def open_recording(name: str) -> Iterator[rr.RecordingStream]:
+    """Open a separate stream, without the clock and the counter that Rerun adds to each message."""
+    recording = rr.RecordingStream("ipsys", send_properties=False)
+    recording.set_log_time_enabled(False)
+    recording.set_log_tick_enabled(False)
+    recording.send_recording_name(name)
+    try:
+        yield recording
+    finally:
+        recording.disconnect()
 
 
 def symbol_scale(rig: Rig | None) -> float:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Generator, Iterable, Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
@@ -174,7 +174,7 @@ class LiveCameras:
                 lambda: saving.confirmed or (self._closed and not saving.written), _SAVED_S
             )
             self._saving.remove(saving)
-            is_waiting = _has(self._waiting, saving.arrival)
+            is_waiting = any(arrival is saving.arrival for arrival in self._waiting)
             self._waiting = deque(arrival for arrival in self._waiting if arrival is not saving.arrival)
             closed = self._closed
         if saving.fault is not None:
@@ -285,10 +285,6 @@ def _bytes_of(arrival: Arrival | None) -> int:
     """Return the size of a frame, in bytes; 0 for any other message."""
     frame = None if arrival is None else arrival.payload
     return len(frame.data) if isinstance(frame, (CompressedImage, CompressedVideo)) else 0
-
-
-def _has(arrivals: Iterable[Arrival], arrival: Arrival) -> bool:
-    return any(other is arrival for other in arrivals)
 
 
 def _reader_threads(readers: Sequence[CameraReader]) -> list[threading.Thread]:

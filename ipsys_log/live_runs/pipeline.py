@@ -182,7 +182,7 @@ def measure(
         Backlog(cameras, log, cameras.now_ns, recent.put) as frames,
     ):
         for message in _through(plan.stages, chain(settings, frames)):
-            _show_all(show, *frames.take_events(), message)
+            show(*frames.take_events(), message)
     log.check_disk()
     show.check()
     return log.counts
@@ -237,8 +237,8 @@ def live(
         if fault is not None:
             cameras.add_event("stages_stopped", f"{fault}; the recording continues")
             for message in arriving:
-                _show_all(show, *events(), message)
-        _show_all(show, *events())
+                show(*events(), message)
+        show(*events())
     log.check_file()
     if fault is not None:
         raise IpsysError(
@@ -299,7 +299,7 @@ def _put_through(
             if _route_of(message) in computed:  # all other messages are written already
                 entry = ledger.entry(message)
                 log.put(message)
-            _show_all(show, *events(), message)
+            show(*events(), message)
             if entry is not None:
                 log.put(entry)
                 show(entry)
@@ -325,8 +325,3 @@ def _route_of(message: Message) -> Route | None:
     run_name = run_of_topic(message.topic)
     channel = channel_of(message.topic, type(message.payload)) if run_name is not None else None
     return None if channel is None else Route(channel, run_name)
-
-
-def _show_all(show: FanOut, *messages: Message) -> None:
-    for message in messages:
-        show(message)

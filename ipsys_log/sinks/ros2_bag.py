@@ -166,11 +166,7 @@ class _Bag:
         self._now_ns = message.payload.timestamp
         self.known.update(track.robot for track in message.payload.tracks)
         poses = list(self._poses.read(message))
-        sent = [
-            (pose, pose.track.heading_rad)
-            for pose in poses
-            if pose.is_good and pose.track.heading_rad is not None and is_stampable(pose.time_ns)
-        ]
+        sent = ros2.sendable(poses)
         self.poses += len(sent)
         self.left_out += len(poses) - len(sent)
         log_ns, time_ns = message.log_time_ns, message.payload.timestamp

@@ -184,8 +184,12 @@ class FanOut:
         for worker in self._workers:
             worker.finish()
 
-    def __call__(self, message: Message) -> None:
-        """Hand a message to each sink."""
+    def __call__(self, *messages: Message) -> None:
+        """Hand messages to each sink, one after the other."""
+        for message in messages:
+            self._show(message)
+
+    def _show(self, message: Message) -> None:
         if isinstance(message.payload, SkippedVideo):
             message = replace(message, payload=message.payload.frame)
         for outlet in tuple(self._outlets):

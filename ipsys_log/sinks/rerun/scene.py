@@ -2,10 +2,10 @@
 
 import heapq
 import math
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Generic, NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 import rerun as rr
@@ -250,7 +250,7 @@ class Fading:
 
 
 Point = tuple[float, float, float]
-Key = TypeVar("Key", bound=Hashable)
+Key = tuple[str | None, str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -270,7 +270,7 @@ class _Pose:
     point_m: Point
 
 
-class Trails(Generic[Key]):
+class Trails:
     """The trails of robots: it joins the poses of each robot, and passes each segment to ``draw``.
 
     Several poses of one instant count as the last of them: tracks of earlier versions have one from each

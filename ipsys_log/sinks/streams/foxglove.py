@@ -16,7 +16,7 @@ from contextlib import suppress
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
-from websockets.asyncio.server import Server, ServerConnection, broadcast, serve
+from websockets.asyncio.server import ServerConnection, broadcast, serve
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
@@ -169,13 +169,9 @@ class FoxgloveStream:
             logger=_LOGGER,
         ) as server:
             await self._ended.wait()
-            self._abort(server)
-
-    @staticmethod
-    def _abort(server: Server) -> None:
-        """End all connections now: a stalled client would delay the end."""
-        for connection in server.connections:
-            connection.transport.abort()
+            # A stalled client would delay the end.
+            for connection in server.connections:
+                connection.transport.abort()
 
     def _connect(self, *arguments: Any, **options: Any) -> ServerConnection:
         """Return a new connection, and close the oldest one of too many that have sent no request."""

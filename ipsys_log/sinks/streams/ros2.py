@@ -133,11 +133,7 @@ class Ros2Stream:
         for pose in poses:
             if pose.track.robot in self._newest or len(self._newest) < _MOST_ROBOTS:
                 self._newest[pose.track.robot] = pose
-        sent = [
-            (pose, pose.track.heading_rad)
-            for pose in poses
-            if pose.is_good and pose.track.heading_rad is not None and is_stampable(pose.time_ns)
-        ]
+        sent = ros2.sendable(poses)
         if sent:
             self._put(self._transforms, ros2.encode_transforms(sent))
         for pose, heading_rad in sent:

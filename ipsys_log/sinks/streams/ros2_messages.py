@@ -102,6 +102,15 @@ def _transform(time_ns: int, parent: str, child: str, xyz_m: Iterable[float], ro
     return make("geometry_msgs/TransformStamped", make_header(time_ns, parent), child, moved)
 
 
+def sendable(poses: Iterable[StreamPose]) -> list[tuple[StreamPose, float]]:
+    """Return the poses that ROS 2 gets, with their headings in rad: current ones, inside, with a stamp."""
+    return [
+        (pose, pose.track.heading_rad)
+        for pose in poses
+        if pose.is_good and pose.track.heading_rad is not None and is_stampable(pose.time_ns)
+    ]
+
+
 def encode_transforms(poses: Iterable[tuple[StreamPose, float]]) -> bytes:
     """Return the message of ``/tf`` with poses and their headings in rad."""
     rows = []

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 from ipsys_log.capture.frames import Clock, Frame, Say, SourceError, SourceMessage
 from ipsys_log.capture.nodes.network import AUTHORITY, NodeNetwork, open_centre_session
@@ -31,9 +31,6 @@ from ipsys_log.capture.nodes.wire import (
 from ipsys_log.messages import RigCamera
 from ipsys_log.messages.rig_file import check_name
 from ipsys_log.units import NS_PER_S
-
-if TYPE_CHECKING:
-    import zenoh
 
 _SCHEME = "zenoh:"
 _MOST_WAITING_BYTES = 64 << 20
@@ -136,22 +133,20 @@ class Centre:
     Raises
     ------
     IpsysError
-        On entering: the centre cannot listen.
+        The centre cannot listen.
     """
 
     def __init__(self, cameras: Sequence[RigCamera], network: NodeNetwork, version: str) -> None:
         self._nodes = {camera.name: node_of(camera) for camera in cameras}
         self._network, self._version = network, version
-        self._session: zenoh.Session | None = None
+        self._session: Any = open_centre_session(network, list(self._nodes.values()))
         self._links: dict[str, _Link] = {}
 
     def __enter__(self) -> Self:
-        self._session = open_centre_session(self._network, list(self._nodes.values()))
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._session is not None:
-            self._session.close()  # type: ignore[no-untyped-call]
+        self._session.close()
 
     @contextmanager
     def open(

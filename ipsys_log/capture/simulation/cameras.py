@@ -70,7 +70,7 @@ def mount_cameras(settings: LabSettings, time_ns: int = 0) -> tuple[Camera, ...]
 def row_of_cameras(count: int) -> tuple[Array, float]:
     """Return the y of cameras in a row above the floor, (count,), and the distance of two of them, in m."""
     spacing_m = (FLOOR_M - 2 * _FROM_WALL_M) / max(count - 1, 2)
-    ys_m: Array = FLOOR_M / 2 + spacing_m * (np.arange(count) - (count - 1) / 2)
+    ys_m = np.asarray(FLOOR_M / 2 + spacing_m * (np.arange(count) - (count - 1) / 2), dtype=np.float64)
     return ys_m, spacing_m
 
 

@@ -170,14 +170,8 @@ class _Bag:
         self.poses += len(sent)
         self.left_out += len(poses) - len(sent)
         log_ns, time_ns = message.log_time_ns, message.payload.timestamp
-        if sent:
-            self._put("/tf", ros2.TF, log_ns, time_ns, ros2.encode_transforms(sent))
-        for pose, heading_rad in sent:
-            robot = pose.track.robot
-            self._put(f"/{robot}/pose", ros2.POSE, log_ns, time_ns, ros2.encode_pose(pose, heading_rad))
-            if pose.velocity is not None:
-                data = ros2.encode_odometry(pose, heading_rad, pose.velocity)
-                self._put(f"/{robot}/odom", ros2.ODOMETRY, log_ns, time_ns, data)
+        for topic, ros_type, data in ros2.encode_poses(sent):
+            self._put(topic, ros_type, log_ns, time_ns, data)
 
     def _put(
         self, topic: str, ros_type: str, log_ns: int, time_ns: int, data: bytes, is_latched: bool = False

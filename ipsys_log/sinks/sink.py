@@ -207,7 +207,8 @@ class FanOut:
 
     def _report(self, name: str, fault: Exception) -> None:
         self._fault = self._fault or fault
-        self._warn("sink_stopped", f"{name} stopped ({_text_of(fault)}); the recording continues")
+        text = " ".join(str(fault).split()) or type(fault).__name__
+        self._warn("sink_stopped", f"{name} stopped ({text}); the recording continues")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -249,8 +250,3 @@ class _Worker:
         except Exception as fault:  # any error: the frames are more important
             self.queue.close()
             self._report(self._sink.name, fault)
-
-
-def _text_of(fault: Exception) -> str:
-    """Return the text of an error on one line; its type if it has no text."""
-    return " ".join(str(fault).split()) or type(fault).__name__

@@ -144,17 +144,14 @@ def _start_relay(run: RobotRun, robot: str, number: int, ports: Ports, stack: Ex
 
 def _start(command: Sequence[str], stack: ExitStack, output: int | None = None) -> subprocess.Popen[bytes]:
     try:
+        # Python shows its prints at once.
+        environment = {**os.environ, "PYTHONUNBUFFERED": "1", "OPENBLAS_NUM_THREADS": "1"}
         # A group of its own: Ctrl-C in the terminal ends the simulator, and this ends its programs.
-        process = subprocess.Popen(command, stdout=output, process_group=0, env=_environment())
+        process = subprocess.Popen(command, stdout=output, process_group=0, env=environment)
     except OSError as error:
         raise IpsysError(f"{command[0]}: cannot be started: {error.strerror}; make it executable") from error
     stack.callback(_end, process)
     return process
-
-
-def _environment() -> dict[str, str]:
-    """Return the environment of a program; Python shows its prints at once."""
-    return {**os.environ, "PYTHONUNBUFFERED": "1", "OPENBLAS_NUM_THREADS": "1"}
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:

@@ -6,7 +6,7 @@ robot has the robot's name; its origin is the marker, and x points along the hea
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
 from math import cos, sin, sqrt
 from typing import TYPE_CHECKING, Any
@@ -194,6 +194,18 @@ def _covariance(known: NDArray[np.float64] | None, yaw_sigma: float | None) -> N
     if yaw_sigma is not None:
         covariance[5, 5] = yaw_sigma**2
     return covariance.ravel()
+
+
+def encode_poses(poses: Iterable[tuple[StreamPose, float]]) -> Iterator[tuple[str, str, bytes]]:
+    """Yield the messages of poses and their headings in rad, each with its topic and its type."""
+    poses = list(poses)
+    if poses:
+        yield "/tf", TF, encode_transforms(poses)
+    for pose, heading_rad in poses:
+        robot = pose.track.robot
+        yield f"/{robot}/pose", POSE, encode_pose(pose, heading_rad)
+        if pose.velocity is not None:
+            yield f"/{robot}/odom", ODOMETRY, encode_odometry(pose, heading_rad, pose.velocity)
 
 
 def encode_diagnostics(

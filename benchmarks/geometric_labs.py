@@ -31,9 +31,15 @@ from tests.geometric.floor_error import (
     locate_with_model,
     summarize,
 )
-from tests.geometric.lab import GeometricLab, GeometricSettings, PlacedMarkers, build_lab, camera_poses
+from tests.geometric.lab import (
+    GeometricLab,
+    GeometricSettings,
+    PlacedMarkers,
+    build_lab,
+    camera_poses,
+    poses_over,
+)
 from tests.geometric.session import simulate_session
-from tests.geometric.stops import poses_over
 
 __all__ = [
     "CONTENDERS",

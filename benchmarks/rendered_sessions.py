@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from scenes import simulator_key
+from stops import PacedDrive
 
 from ipsys_log.capture.simulation.calibration_points import place_marker
 from ipsys_log.capture.simulation.cameras import FloorView, prepare_view
@@ -29,7 +30,6 @@ from ipsys_log.vision.markers import MovingMarker, PlacedMarker
 from tests.geometric.lab import GeometricLab
 from tests.geometric.session import simulate_session
 from tests.geometric.sightings import start_ns, still_times_ns
-from tests.geometric.stops import PacedDrive
 
 __all__ = ["rendered_session"]
 

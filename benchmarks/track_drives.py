@@ -14,6 +14,7 @@ import numpy as np
 from geometric_labs import Scene, Session, fit_session, make_session
 from numpy.typing import NDArray
 from rendered_sessions import rendered_session
+from stops import Pace, Stops, draw_pace, pace_drive, velocities_over
 
 from ipsys_log.calibration.joint.payload import JOINT, joint_payload
 from ipsys_log.capture.simulation.settings import LabSettings
@@ -23,10 +24,9 @@ from ipsys_log.models.locate_points import LocatePoints
 from ipsys_log.stages.camera_frame import CameraFrame
 from ipsys_log.statistics.camera_models import fit_model
 from ipsys_log.units import NS_PER_S
-from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab
+from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab, poses_over
 from tests.geometric.session import simulate_session
 from tests.geometric.sightings import start_ns
-from tests.geometric.stops import Pace, Stops, draw_pace, pace_drive, poses_over, velocities_over
 
 __all__ = ["CALIBRATIONS", "Condition", "SeenDrive", "Truth", "calibrate", "cover", "drive_through"]
 

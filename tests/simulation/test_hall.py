@@ -14,9 +14,8 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Markers, Rig
 from ipsys_log.messages.rig_file import check_rig
 from tests.conftest import Ipsys
-from tests.geometric.lab import GeometricSettings, build_lab
+from tests.geometric.lab import GeometricSettings, build_lab, poses_over
 from tests.geometric.session import simulate_session
-from tests.geometric.stops import poses_over
 
 
 def test_every_place_of_a_hall_is_seen_and_neighbours_overlap() -> None:

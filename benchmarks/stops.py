@@ -1,4 +1,4 @@
-"""Robots that stop and start again on the path of a simulated drive, and the exact motion of any robot."""
+"""Robots that stop and start again on the path of a simulated drive, and their exact velocities."""
 
 from __future__ import annotations
 
@@ -96,12 +96,6 @@ class PacedDrive(Drive):
 def pace_drive(drive: Drive, paces: Mapping[int, Pace]) -> PacedDrive:
     """Return a drive with paces for some of its markers."""
     return PacedDrive(drive.height_m, drive.path, drive.ahead_s, drive.times_s, drive.phases_rad, paces)
-
-
-def poses_over(drive: Drive, marker_id: int, times_s: Array) -> Array:
-    """Return x, y and heading of one marker at times (n,) after the start: (n, 3), in m and rad."""
-    (x_m, y_m), (dx, dy) = drive.follow(marker_id, np.maximum(times_s, 0.0))
-    return np.stack([x_m, y_m, np.arctan2(dy, dx)], axis=1)
 
 
 def velocities_over(drive: Drive, marker_id: int, times_s: Array) -> Array:

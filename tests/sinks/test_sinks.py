@@ -104,13 +104,6 @@ def test_slow_sink_loses_images_before_tracks() -> None:
     assert 0 < len(images) <= 100
 
 
-def test_waiting_messages_are_bounded() -> None:
-    waiting = LiveQueue()
-    for number in range(1000):
-        waiting.put(tracks(number))
-    assert len(drained(waiting)) == 200
-
-
 def test_inline_sink_gets_messages_before_the_call_returns() -> None:
     """A queue and a thread would delay positions on their way to robots."""
     stuck, prompt = Stuck(), Inline()

@@ -109,4 +109,4 @@ def velocities_over(drive: Drive, marker_id: int, times_s: Array) -> Array:
     if isinstance(drive, PacedDrive) and marker_id in drive.paces:
         share = share * drive.paces[marker_id].share_at(eased_s(times_s))
     _, (dx, dy) = drive.follow(marker_id, since_s)
-    return np.stack([dx, dy], axis=1) * (by_way * share)[:, None]
+    return np.asarray(np.stack([dx, dy], axis=1) * (by_way * share)[:, None])

@@ -9,7 +9,7 @@ from dataclasses import MISSING, fields, replace
 from difflib import get_close_matches
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_type_hints
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import (
@@ -361,10 +361,12 @@ def _build(item: type[Item], row: Any, where: str) -> Item:
     missing = [n for n, f in known.items() if f.default is MISSING and n not in row]
     if missing:
         raise IpsysError(f"{where}: {missing[0]} is missing; 'ipsys init' writes an example")
-    return item(**{name: _value(str(known[name].type), row[name], f"{where}: {name}") for name in row})
+    hints = get_type_hints(item)
+    return item(**{name: _value(hints[name], row[name], f"{where}: {name}") for name in row})
 
 
-def _value(kind: str, value: Any, where: str) -> Any:
+def _value(hint: Any, value: Any, where: str) -> Any:
+    kind = hint.__name__ if isinstance(hint, type) else str(hint)
     if kind.startswith("float"):
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             raise IpsysError(f"{where} must be a number, found {_shown(value)}")

@@ -8,7 +8,7 @@ None.
 import json
 import re
 import struct
-from typing import Any, NamedTuple, Self, TypeVar
+from typing import Any, NamedTuple, Self, TypeVar, get_type_hints
 
 _PREFIX = "ipsys"
 _HEADER = struct.Struct("<4s8sQqB")
@@ -134,7 +134,7 @@ def decode_text(kind: type[Text], data: bytes) -> Text | None:
         values = json.loads(data)
     except (ValueError, RecursionError):
         return None
-    types = kind.__annotations__
+    types = get_type_hints(kind)
     if not isinstance(values, dict) or values.keys() != types.keys():
         return None
     is_valid = all(_is_valid(name, value, types[name]) for name, value in values.items())

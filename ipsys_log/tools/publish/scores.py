@@ -1,9 +1,9 @@
 """Scores of models on logs: the errors of an evaluation in mm, and the file of the expected scores."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 from ipsys_log.engine.graph import writer_of, writes
 from ipsys_log.engine.provenance import fingerprint
@@ -70,8 +70,8 @@ class Score:
 
 # The columns of the scores in the manifest.
 SCORE_FIELDS = {
-    field.name: "text" if field.type == "str" else "integer" if field.type == "int" else "number"
-    for field in fields(Score)
+    name: "text" if kind is str else "integer" if kind is int else "number"
+    for name, kind in get_type_hints(Score).items()
 }
 
 

@@ -31,7 +31,14 @@ from tests.geometric.floor_error import (
     locate_with_model,
     summarize,
 )
-from tests.geometric.lab import GeometricLab, GeometricSettings, PlacedMarkers, build_lab, camera_poses
+from tests.geometric.lab import (
+    GeometricLab,
+    GeometricSettings,
+    PlacedMarkers,
+    build_lab,
+    camera_poses,
+    poses_over,
+)
 from tests.geometric.session import simulate_session
 
 __all__ = [
@@ -231,7 +238,7 @@ def held_out_points(lab: GeometricLab, count: int) -> list[KnownSightings]:
 def driving_robots(lab: GeometricLab, count: int) -> list[KnownSightings]:
     """Return sightings of a robot at random times of a long drive."""
     rng, (marker_id, *_) = np.random.default_rng([lab.settings.lab.seed, 2]), lab.drive.ahead_s
-    path = lab.drive.poses_over(marker_id, rng.uniform(0, lab.drive.times_s[-1], count))
+    path = poses_over(lab.drive, marker_id, rng.uniform(0, lab.drive.times_s[-1], count))
     sightings = sight(lab, np.insert(path, 2, lab.robot_heights_m[marker_id], axis=1), rng)
     # The rig has the nominal height of the robots.
     return [replace(seen, heights_m=np.full_like(seen.heights_m, lab.drive.height_m)) for seen in sightings]

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from scenes import simulator_key
+from stops import PacedDrive
 
 from ipsys_log.capture.simulation.calibration_points import place_marker
 from ipsys_log.capture.simulation.cameras import FloorView, prepare_view
@@ -58,7 +59,8 @@ def rendered_session(lab: GeometricLab, folder: Path) -> list[Message]:
 
 
 def _key(lab: GeometricLab) -> str:
-    paces = {robot: (one.times_s.tolist(), one.shares.tolist()) for robot, one in lab.drive.paces.items()}
+    drive_paces = lab.drive.paces if isinstance(lab.drive, PacedDrive) else {}
+    paces = {robot: (one.times_s.tolist(), one.shares.tolist()) for robot, one in drive_paces.items()}
     return simulator_key(f"{lab.settings} {lab.drive.path} {paces} {dict(STAGE.versions)}")
 
 

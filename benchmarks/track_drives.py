@@ -14,9 +14,9 @@ import numpy as np
 from geometric_labs import Scene, Session, fit_session, make_session
 from numpy.typing import NDArray
 from rendered_sessions import rendered_session
+from stops import Pace, Stops, draw_pace, pace_drive, velocities_over
 
 from ipsys_log.calibration.joint.payload import JOINT, joint_payload
-from ipsys_log.capture.simulation.drive import Pace, Stops, draw_pace
 from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.messages import CameraCalibration, CameraPoints, Markers, Message, Model, Positions, Rig
 from ipsys_log.models.locate_corners import LocateCorners
@@ -24,7 +24,7 @@ from ipsys_log.models.locate_points import LocatePoints
 from ipsys_log.stages.camera_frame import CameraFrame
 from ipsys_log.statistics.camera_models import fit_model
 from ipsys_log.units import NS_PER_S
-from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab
+from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab, poses_over
 from tests.geometric.session import simulate_session
 from tests.geometric.sightings import start_ns
 
@@ -115,13 +115,13 @@ class Truth:
 
     def poses(self, robot: int, times_ns: Times) -> Array:
         """Return x, y, z and heading of a robot at times (n,): (n, 4), in m and rad."""
-        path = self.lab.drive.poses_over(robot, self._since_s(times_ns))
+        path = poses_over(self.lab.drive, robot, self._since_s(times_ns))
         heights_m = np.full(len(path), self.lab.robot_heights_m[robot]) + self.lab.floor.at(path[:, :2])
         return np.insert(path, 2, heights_m, axis=1)
 
     def velocities(self, robot: int, times_ns: Times) -> Array:
         """Return the velocities of a robot at times (n,): (n, 2), in m/s."""
-        return self.lab.drive.velocities_over(robot, self._since_s(times_ns))
+        return velocities_over(self.lab.drive, robot, self._since_s(times_ns))
 
     def _since_s(self, times_ns: Times) -> Array:
         since: Array = (times_ns - self.late_ns - start_ns(self.lab, len(self.lab.points))) / NS_PER_S
@@ -181,7 +181,9 @@ def drive_through(condition: Condition, model: Model, seed: int, duration_s: flo
     )
     lab = build_lab(condition.settings(settings, 0))
     noise = replace(lab.settings, lab=replace(lab.settings.lab, seed=seed + _OTHER_NOISE))
-    drive = replace(lab.drive.mirror(), paces=_paces(condition, seed, duration_s))
+    path = replace(lab.drive.path, mirrored=not lab.drive.path.mirrored)
+    mirrored = replace(lab.drive, path=path)
+    drive = pace_drive(mirrored, _paces(condition, seed, duration_s))
     lab = replace(lab, settings=noise, drive=drive)
     keep = condition.keep
     messages = list(simulate_session(lab)) if keep is None else rendered_session(lab, keep)

@@ -30,6 +30,7 @@ from pathlib import Path
 from results import Report, command
 from rounds import Row
 from scenes import CACHE
+from stops import Stops
 from threadpoolctl import threadpool_limits
 from track_contenders import COASTING, CONTENDERS
 from track_coverage import COVERAGE_DRIVE_S, coverage_of_lab, coverage_table
@@ -44,7 +45,6 @@ from track_errors import (
 )
 
 from ipsys_log.calibration.joint.payload import JOINT
-from ipsys_log.capture.simulation.drive import Stops
 from ipsys_log.errors import FitError
 
 __all__ = ["measure"]

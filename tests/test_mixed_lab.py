@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from ipsys_log.capture.camera_thread import imported_run
 from ipsys_log.capture.frames import CameraState, Clock, Frame, Open, Say
 from ipsys_log.capture.lab import first_messages
 from ipsys_log.capture.live_plan import plan_live
@@ -72,7 +73,7 @@ def mixed(
     with attached:
         with Session([replayed_log]) as session:
             (rig,) = session.payloads(["/rig"])
-        settings = first_messages(rig, lenses(replayed_log), attached.now_ns, attached.imported_run)
+        settings = first_messages(rig, lenses(replayed_log), attached.now_ns, imported_run(attached.states))
         if request.param == "live":
             pipeline.live(attached, settings, target, wanted, sinks=[clock.watch])
         else:

@@ -6,10 +6,8 @@ import threading
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from types import TracebackType
 
-from ipsys_log.capture.disk import Confirm
-from ipsys_log.capture.recorder import Recording, Source, Target, write_each
+from ipsys_log.capture.recorder import Recording, Source, write_each
 from ipsys_log.errors import WriteError
 from ipsys_log.messages import (
     EVENTS_TOPIC,
@@ -128,11 +126,18 @@ class Backlog:
     source : messages, and None if no message came.
     log : the log for all messages.
     now_ns : returns a log time for an event; called by the thread that reads the source.
+    put : takes the messages for the log; None: the log itself does.
     """
 
-    def __init__(self, source: Source, log: Target, now_ns: Callable[[], int]) -> None:
+    def __init__(
+        self,
+        source: Source,
+        log: Recording,
+        now_ns: Callable[[], int],
+        put: Callable[[Message], None] | None = None,
+    ) -> None:
         self.skipped: Counter[str] = Counter()
-        self._source, self._log, self._now_ns = source, log, now_ns
+        self._source, self._log, self._now_ns, self._put = source, log, now_ns, put or log.put
         self._waiting = Waiting()
         self._events: list[Message] = []
         self._ended = False
@@ -144,9 +149,7 @@ class Backlog:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         self._source.stop()
         self._thread.join(_LAST_S if isinstance(error, KeyboardInterrupt) else None)
 
@@ -171,7 +174,7 @@ class Backlog:
 
     def _record(self) -> None:
         try:
-            for message in write_each(self._source, self._log):
+            for message in write_each(self._source, self._log, self._put):
                 if message.camera is not None or _is_read(message):
                     self._hand_on(message)
                 elif isinstance(message.payload, Event):
@@ -193,7 +196,7 @@ class Backlog:
             text = f"a frame of camera {camera} is skipped: processing cannot keep up. The frame is recorded"
             event = Event(late.log_time_ns, FRAME_SKIPPED, text, camera)
             report = Message(EVENTS_TOPIC, self._now_ns(), event.timestamp, event)
-            self._log.put(report)
+            self._put(report)
             self._note(report)
 
     def _note(self, event: Message) -> None:
@@ -238,23 +241,9 @@ class RecentFrames:
     def __enter__(self) -> RecentFrames:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         if not isinstance(error, (WriteError, KeyboardInterrupt)):
             self._write()
-
-    @property
-    def is_deleted(self) -> bool:
-        return self._log.is_deleted
-
-    @property
-    def full(self) -> WriteError | None:
-        return self._log.full
-
-    @property
-    def fault(self) -> OSError | None:
-        return self._log.fault
 
     def put(self, message: Message) -> None:
         """Append the next message of a recording.
@@ -279,14 +268,6 @@ class RecentFrames:
             oldest = self._take()
             if not _is_frame(oldest):
                 self._log.put(oldest)
-
-    def flush(self) -> None:
-        """Flush the written messages to the operating system."""
-        self._log.flush()
-
-    def sync(self, confirm: Confirm) -> None:
-        """Sync the flushed messages to the disk, and ``confirm`` it."""
-        self._log.sync(confirm)
 
     def _write(self, since_ns: int | None = None) -> None:
         """Write all messages of the buffer; of the frames, only those since ``since_ns`` (None: no frame)."""

@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 
 from ipsys_log.capture.frames import CameraState
 from ipsys_log.errors import LogError, WriteError, is_full
@@ -25,7 +24,6 @@ _LAST_S = 1.0
 
 # The function is called with None when the earlier data are on the disk, or with the error of the disk.
 Confirm = Callable[[OSError | None], None]
-# Linux names the present path of each open file here; other systems do not.
 
 
 class Syncer:
@@ -55,9 +53,7 @@ class Syncer:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         with self._changed:
             self._ended = True
             self._changed.notify()

@@ -103,6 +103,17 @@ Say = Callable[[str], None]
 Open = Callable[[RigCamera, Clock, Say], AbstractContextManager[Iterator[Frame | SourceMessage | None]]]
 
 
+_TURN_S = 0.4
+
+
+def sleep_until(time_ns: int, clock: Clock) -> Iterator[None]:
+    """Sleep until a time; yield None twice a second, as the iterator of an :data:`Open` must."""
+    while (left_s := (time_ns - clock.now_ns()) / NS_PER_S) > 0:
+        time.sleep(min(left_s, _TURN_S))
+        if left_s > _TURN_S:
+            yield None
+
+
 def mid_exposure_ns(stamp_ns: int, camera: RigCamera) -> int:
     """Return the time of the middle of the exposure of a frame's first row, from the driver's stamp.
 

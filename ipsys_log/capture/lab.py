@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
 
+from ipsys_log.capture.camera_thread import imported_run
 from ipsys_log.capture.devices import source_opener
 from ipsys_log.capture.disk import DiskRoom, expected_bytes_per_s, free_room
 from ipsys_log.capture.frames import Clock, Open, Say
@@ -101,7 +102,7 @@ def open_lab(
         cameras = stack.enter_context(LiveCameras(lab.cameras, open_source, clock or Clock(), say))
         sizes_px = {name: state.size_px for name, state in cameras.states.items()}
         lenses = fitting_lenses(lab.lenses, sizes_px, say)
-        settings = first_messages(lab.rig, lenses, cameras.now_ns, cameras.imported_run, lab.assumed)
+        settings = first_messages(lab.rig, lenses, cameras.now_ns, imported_run(cameras.states), lab.assumed)
         yield OpenLab(lab, cameras, lenses, settings)
 
 

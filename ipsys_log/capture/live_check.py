@@ -10,16 +10,14 @@ from __future__ import annotations
 
 import threading
 from collections import Counter, deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from math import hypot
-from types import TracebackType
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
-from ipsys_log.capture.recorder import Source
 from ipsys_log.errors import FrameError
 from ipsys_log.messages import CAMERA_MOVED, Array, CompressedImage, CompressedVideo, Markers, Message, Rig
 from ipsys_log.stages.detect.misprints import find_misprints
@@ -287,9 +285,7 @@ class CameraMonitor:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._ended.set()
         self._thread.join()
 
@@ -334,27 +330,18 @@ class CameraMonitor:
         return FrameCheck(tuple(sorted(counts)), unknown, brightness, sharpness, tuple(warnings))
 
 
-class KnockEvents:
-    """A sink of live results that adds an event, and prints its text, when a camera has moved.
+def knock_events(rig: Rig, add_event: Callable[[str, str, str | None], object]) -> Callable[[Message], None]:
+    """Return a sink of live results that adds an event, and prints its text, when a camera has moved.
 
     The event is recorded and never derived: a replay does not repeat it, and no stage reads it.
-
-    Parameters
-    ----------
-    cameras : the source of the recording; it gets the events.
     """
+    monitor = KnockMonitor(rig)
 
-    def __init__(self, cameras: Source) -> None:
-        self._cameras = cameras
-        self._monitor: KnockMonitor | None = None
+    def watch(message: Message) -> None:
+        for knock in monitor(message):
+            add_event(CAMERA_MOVED, knock.text, knock.camera)
 
-    def __call__(self, message: Message) -> None:
-        """Handle one message; the rig comes first."""
-        if isinstance(message.payload, Rig):
-            self._monitor = KnockMonitor(message.payload)
-        elif self._monitor is not None:
-            for knock in self._monitor(message):
-                self._cameras.add_event(CAMERA_MOVED, knock.text, knock.camera)
+    return watch
 
 
 def _unknown(ids: tuple[int, ...]) -> str:

@@ -30,10 +30,11 @@ from ipsys_log.stages.detect import usual_corners
 class LivePlan(NamedTuple):
     """The plan of a live run.
 
-    It has the completed request, and the models of another log with the tasks that copy them. It also has the
-    runs in the order of their records, and the causal stages.
+    It has the rig, the completed request, and the models of another log with the tasks that copy them. It
+    also has the runs in the order of their records, and the causal stages.
     """
 
+    rig: Rig
     request: Request
     copied: list[tuple[Task, Model]]
     runs: list[LiveRun]
@@ -95,9 +96,9 @@ class _LiveView:
 
 
 def plan_live(
-    cameras: Collection[str], settings: Sequence[Message], request: Request, until: str | None
+    cameras: Mapping[str, CameraState], settings: Sequence[Message], request: Request, until: str | None
 ) -> LivePlan:
-    """Plan a live run like a replay of its log.
+    """Plan a live run like a replay of its log; ``cameras`` are the states of the cameras.
 
     Raises
     ------
@@ -107,14 +108,14 @@ def plan_live(
     """
     lenses = {str(message.camera) for message in settings if isinstance(message.payload, CameraCalibration)}
     (rig,) = (message.payload for message in settings if isinstance(message.payload, Rig))
-    arriving = imported_run(cameras) if isinstance(cameras, Mapping) else None
-    pictured = _pictured(cameras)
+    # Nodes can send markers instead of frames.
+    pictured = [name for name, state in cameras.items() if state.format != MARKERS_FORMAT]
     request = replace(request, corners=request.corners or usual_corners(pictured, lenses))
     copied = _copied(request, until)
     models = [model for _, model in copied]
     _check(rig, cameras, lenses, models, until)
-    wired = _wire(pictured, settings, lenses, request, copied, until, arriving)
-    return LivePlan(request, copied, *wired)
+    wired = _wire(pictured, settings, lenses, request, copied, until, imported_run(cameras))
+    return LivePlan(rig, request, copied, *wired)
 
 
 def check_start(
@@ -196,12 +197,6 @@ def _check(
                 f"{model.name} needs the height of the markers above the floor: write marker_height_m into "
                 "lab.toml"
             )
-
-
-def _pictured(cameras: Collection[str]) -> list[str]:
-    """Return the cameras that send frames; nodes can send markers instead."""
-    states = cameras if isinstance(cameras, Mapping) else {}
-    return [name for name in cameras if name not in states or states[name].format != MARKERS_FORMAT]
 
 
 def check_independent_frames(cameras: Mapping[str, CameraState]) -> None:

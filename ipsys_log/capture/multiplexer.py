@@ -9,13 +9,12 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Generator, Iterable, Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Any
 
-from ipsys_log.capture.camera_thread import Arrival, CameraReader, Pause, ReaderContext, imported_run
+from ipsys_log.capture.camera_thread import Arrival, CameraReader, Pause, ReaderContext
 from ipsys_log.capture.frames import Clock, Heartbeat, Open, Say, SourceError
 from ipsys_log.capture.nodes.centre import is_of_node
 from ipsys_log.capture.nodes.receiver import passing_period_s
@@ -101,9 +100,7 @@ class LiveCameras:
         self._started.set()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         self._end(_LAST_S if isinstance(error, KeyboardInterrupt) else None)
 
     def stop(self, reason: str | None = None) -> None:
@@ -117,11 +114,6 @@ class LiveCameras:
         """
         self._reason = reason or self._reason
         self._ending = True
-
-    @property
-    def imported_run(self) -> str | None:
-        """The run of the markers that nodes send instead of frames; None if no camera sends markers."""
-        return imported_run(self.states)
 
     @property
     def is_stopped(self) -> bool:
@@ -182,7 +174,7 @@ class LiveCameras:
                 lambda: saving.confirmed or (self._closed and not saving.written), _SAVED_S
             )
             self._saving.remove(saving)
-            is_waiting = _has(self._waiting, saving.arrival)
+            is_waiting = any(arrival is saving.arrival for arrival in self._waiting)
             self._waiting = deque(arrival for arrival in self._waiting if arrival is not saving.arrival)
             closed = self._closed
         if saving.fault is not None:
@@ -293,10 +285,6 @@ def _bytes_of(arrival: Arrival | None) -> int:
     """Return the size of a frame, in bytes; 0 for any other message."""
     frame = None if arrival is None else arrival.payload
     return len(frame.data) if isinstance(frame, (CompressedImage, CompressedVideo)) else 0
-
-
-def _has(arrivals: Iterable[Arrival], arrival: Arrival) -> bool:
-    return any(other is arrival for other in arrivals)
 
 
 def _reader_threads(readers: Sequence[CameraReader]) -> list[threading.Thread]:

@@ -9,14 +9,13 @@ from pathlib import Path
 from typing import Protocol
 
 from ipsys_log.capture.disk import (
-    Confirm,
     Syncer,
     describe_disk_failure,
     describe_disk_fault,
     describe_disk_full,
     reserve,
 )
-from ipsys_log.capture.frames import Clock, Say
+from ipsys_log.capture.frames import CameraState, Clock, Say
 from ipsys_log.engine.output import serialize, write_message
 from ipsys_log.errors import IpsysError, LogError, WriteError, is_full
 from ipsys_log.log.journal import DISK, open_locked, roll_back
@@ -52,7 +51,7 @@ class CameraSource(Source, Protocol):
     """The cameras of a live run: their states, their clock, and the arrival times of frames by log time."""
 
     @property
-    def states(self) -> Mapping[str, object]: ...
+    def states(self) -> Mapping[str, CameraState]: ...
 
     @property
     def clock(self) -> Clock: ...
@@ -64,29 +63,6 @@ class CameraSource(Source, Protocol):
     def say(self) -> Say: ...
 
     def now_ns(self) -> int: ...
-
-
-class Target(Protocol):
-    """Destination of messages, in the order of their log times.
-
-    ``full`` is set if the disk is full, ``fault`` if it failed to keep written messages. ``is_deleted`` is
-    True if another program has deleted the file.
-    """
-
-    @property
-    def is_deleted(self) -> bool: ...
-
-    @property
-    def full(self) -> WriteError | None: ...
-
-    @property
-    def fault(self) -> OSError | None: ...
-
-    def put(self, message: Message) -> None: ...
-
-    def flush(self) -> None: ...
-
-    def sync(self, confirm: Confirm) -> None: ...
 
 
 class Recording:
@@ -130,15 +106,6 @@ class Recording:
         """Pass all messages to the disk."""
         self._write(self._writer.flush)
 
-    def sync(self, confirm: Confirm) -> None:
-        """Sync the flushed messages to the disk, and ``confirm`` it from another thread."""
-        self.syncer.soon(confirm)
-
-    @property
-    def fault(self) -> OSError | None:
-        """The first error of the disk when it failed to keep written messages."""
-        return self.syncer.fault
-
     def look(self) -> None:
         """Note whether another program has deleted or renamed the log."""
         try:
@@ -181,8 +148,8 @@ class Recording:
         self.check_file()
         if self.full is not None:
             raise IpsysError(describe_disk_full(self.path, self.full)) from self.full
-        if self.fault is not None:
-            raise IpsysError(describe_disk_failure(self.path, self.fault)) from self.fault
+        if (fault := self.syncer.fault) is not None:
+            raise IpsysError(describe_disk_failure(self.path, fault)) from fault
 
     def settle(self) -> bool:
         """Prevent further writes from all threads; return False if a thread is still writing."""
@@ -206,32 +173,35 @@ class Recording:
             self._torn = False
 
 
-def write_each(source: Source, log: Target) -> Iterator[Message]:
-    """Yield the messages of a source, each after it was written.
+def write_each(
+    source: Source, log: Recording, put: Callable[[Message], None] | None = None
+) -> Iterator[Message]:
+    """Yield the messages of a source, each after it was written, or after ``put`` has taken it.
 
     A measurement is confirmed as soon as it is on the disk. When the disk is full, or another program has
     deleted the log, the source is stopped.
     Messages other than frames are still written, to the reserved space.
     """
+    put = put or log.put
     warned, ticks = False, 0
     with closing(iter(source)) as messages:
         for message in messages:
-            if log.fault is not None and not warned:
+            if (fault := log.syncer.fault) is not None and not warned:
                 warned = True
                 source.add_event(
-                    "disk_fault", f"{describe_disk_fault(log.fault)}; the last written messages may be lost"
+                    "disk_fault", f"{describe_disk_fault(fault)}; the last written messages may be lost"
                 )
             ticks = 0 if message is not None else ticks + 1
             if message is None:
                 if ticks % _QUIET_TICKS == 0:
                     log.flush()
             elif log.full is None or not isinstance(message.payload, (CompressedImage, CompressedVideo)):
-                log.put(message)
+                put(message)
                 if isinstance(message.payload, Event) and message.payload.kind == STAMP_UNRELIABLE:
                     log.flush()  # the file never has the affected frames without this event
                 if isinstance(message.payload, Measurement):
                     log.flush()
-                    log.sync(partial(source.confirm, message))
+                    log.syncer.soon(partial(source.confirm, message))
                 yield message
             else:
                 continue

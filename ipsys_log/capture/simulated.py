@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import fields, replace
@@ -13,7 +12,7 @@ from typing import NamedTuple
 from urllib.parse import parse_qsl, urlencode
 
 from ipsys_log.calibration.board import Board, parse_board
-from ipsys_log.capture.frames import ActualSettings, Clock, Frame, Say, report_refused_settings
+from ipsys_log.capture.frames import ActualSettings, Clock, Frame, Say, report_refused_settings, sleep_until
 from ipsys_log.capture.simulation.cameras import Check, mount_cameras
 from ipsys_log.capture.simulation.live_lab import (
     LIVE_SETTINGS,
@@ -29,7 +28,6 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.messages import CameraCalibration, RigCamera
 from ipsys_log.units import NS_PER_S
 
-_TURN_S = 0.4
 _LATENCY_NS = 4_000_000
 # Squares of a board that a source names. Intrinsics do not depend on their size.
 _SQUARE_M, _MARKER_SCALE, _DICTIONARY = 0.03, 0.75, "DICT_4X4_50"
@@ -246,9 +244,6 @@ def _play(images: _Images, timing: FrameTiming, clock: Clock) -> Iterator[Frame 
         # A late reader misses frames.
         frame = max(frame + 1, timing.frame_at(clock.now_ns()))
         time_ns = round(frame * timing.period_ns)
-        while (left_s := (time_ns - (clock.now_ns() - timing.behind_ns)) / NS_PER_S) > 0:
-            time.sleep(min(left_s, _TURN_S))
-            if left_s > _TURN_S:
-                yield None
+        yield from sleep_until(time_ns + timing.behind_ns, clock)
         data = images.image(frame)
         yield None if data is None else Frame(data, "jpeg", time_ns + timing.stamp_ns)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import heapq
 import re
-import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from itertools import repeat
@@ -14,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import simplejpeg
 
-from ipsys_log.capture.frames import Clock, Frame, Say, SourceError
+from ipsys_log.capture.frames import Clock, Frame, Say, SourceError, sleep_until
 from ipsys_log.extras import check_installed
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
@@ -284,9 +283,6 @@ def read_videos(
             yield Message(image_topic(camera), log_ns, time_ns, payload, camera)
 
 
-_TURN_S = 0.4
-
-
 @contextmanager
 def open_playback(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Frame | None]]:
     """Open a file as a live camera; an :data:`~ipsys_log.capture.frames.Open`.
@@ -360,8 +356,5 @@ def _recorded(session: Session, topic: str) -> Iterator[TimedFrame]:
 def _play(frames: Iterator[TimedFrame], clock: Clock) -> Iterator[Frame | None]:
     start_ns = clock.now_ns()
     for since_ns, data, format in frames:
-        while (left_s := (start_ns + since_ns - clock.now_ns()) / NS_PER_S) > 0:
-            time.sleep(min(left_s, _TURN_S))
-            if left_s > _TURN_S:
-                yield None
+        yield from sleep_until(start_ns + since_ns, clock)
         yield Frame(data, format, start_ns + since_ns)

@@ -36,7 +36,7 @@ from pathlib import Path
 
 from ipsys_log.capture.backlog import Backlog, RecentFrames
 from ipsys_log.capture.frames import SourceError
-from ipsys_log.capture.live_check import KnockEvents
+from ipsys_log.capture.live_check import knock_events
 from ipsys_log.capture.live_plan import check_independent_frames, plan_live
 from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.capture.recorder import CameraSource, Recording, open_recording, write_each
@@ -179,10 +179,10 @@ def measure(
         one_blas_thread(),
         open_recording(target, settings, overwrite) as log,
         RecentFrames(log) as recent,
-        Backlog(cameras, recent, cameras.now_ns) as frames,
+        Backlog(cameras, log, cameras.now_ns, recent.put) as frames,
     ):
         for message in _through(plan.stages, chain(settings, frames)):
-            _show_all(show, *frames.take_events(), message)
+            show(*frames.take_events(), message)
     log.check_disk()
     show.check()
     return log.counts
@@ -223,8 +223,9 @@ def live(
     """
     plan = plan_live(cameras.states, settings, request, until)
     first = (*settings, *plan.copies(cameras.now_ns))
+    knocks = knock_events(plan.rig, cameras.add_event)
     with (
-        FanOut([KnockEvents(cameras), _contradictions(cameras.say), *sinks], cameras.add_event) as show,
+        FanOut([knocks, _contradictions(cameras.say), *sinks], cameras.add_event) as show,
         one_blas_thread(),
         open_recording(target, first, overwrite) as log,
         ExitStack() as resources,
@@ -236,8 +237,8 @@ def live(
         if fault is not None:
             cameras.add_event("stages_stopped", f"{fault}; the recording continues")
             for message in arriving:
-                _show_all(show, *events(), message)
-        _show_all(show, *events())
+                show(*events(), message)
+        show(*events())
     log.check_file()
     if fault is not None:
         raise IpsysError(
@@ -298,7 +299,7 @@ def _put_through(
             if _route_of(message) in computed:  # all other messages are written already
                 entry = ledger.entry(message)
                 log.put(message)
-            _show_all(show, *events(), message)
+            show(*events(), message)
             if entry is not None:
                 log.put(entry)
                 show(entry)
@@ -324,8 +325,3 @@ def _route_of(message: Message) -> Route | None:
     run_name = run_of_topic(message.topic)
     channel = channel_of(message.topic, type(message.payload)) if run_name is not None else None
     return None if channel is None else Route(channel, run_name)
-
-
-def _show_all(show: FanOut, *messages: Message) -> None:
-    for message in messages:
-        show(message)

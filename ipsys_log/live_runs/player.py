@@ -8,7 +8,6 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing
 from itertools import chain
-from types import TracebackType
 from typing import TYPE_CHECKING, NamedTuple
 
 from ipsys_log.capture.frames import Clock
@@ -83,9 +82,7 @@ class Tracker:
             raise self._fault
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         self.stop()
         self._thread.join()
         if self._fault is not None and error is None:
@@ -141,7 +138,7 @@ class Tracker:
 _TURN_S = 0.1
 
 
-class Player:
+class Player(Playback):
     """A playback of logs in a thread. A context manager, made by :func:`ipsys_log.api.python_api.play`.
 
     Iterate over the newest tracks, each at its time. The end of the block ends the playback.
@@ -149,6 +146,7 @@ class Player:
     Attributes
     ----------
     runs : the runs of the played tracks; none: ground truth.
+    streams : the open streams.
     lines : a line for each stream about its receivers, and one if the rig names no robots.
     scene : the constant parts of the first log; None without a dashboard.
     """
@@ -190,17 +188,17 @@ class Player:
             if has_dashboard:
                 self.scene = read_scene(*logs[0], rigs[0])
                 logs = [(session, dashboard_topics(session, chosen)) for session, chosen in logs]
-            playback = self._playback = _open_playback(logs, options, clock)
+            self._open(logs, options, clock)
             tracks = {chosen.tracks for _, chosen in logs}
-            number, is_replayed, now_ns = playback.session, not options.restamp, playback.now_ns
+            number, is_replayed, now_ns = self.session, not options.restamp, self.now_ns
             context = StreamContext(settings, tracks, now_ns, self._warn, number, robots, is_replayed)
-            self._streams: Sequence[Stream] = self._stack.enter_context(open_streams(context))
+            self.streams: Sequence[Stream] = self._stack.enter_context(open_streams(context))
         except BaseException:
             self._stack.close()
             raise
         self.runs = tuple(dict.fromkeys(chosen.run for _, chosen in logs if chosen.run is not None))
         self._viewers: list[Sink] = [] if page is None else [_viewer(*viewed, rigs[0], page, say)]
-        lines = [stream.describe() for stream in self._streams]
+        lines = [stream.describe() for stream in self.streams]
         lines += [] if page is None else [page.describe()]
         if settings and not robots:
             lines.append("the rig names no robots; the streams name them marker_<id>")
@@ -211,96 +209,38 @@ class Player:
         self._tracker.__enter__()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         with self._stack:
             self._tracker.__exit__(kind, error, trace)
 
     def __iter__(self) -> Iterator[LiveTracks]:
         return iter(self._tracker)
 
-    @property
-    def streams(self) -> Sequence[Stream]:
-        """The open streams."""
-        return self._streams
-
     def show_on(self, sink: Sink) -> None:
         """Send the messages to a further sink; call this before the start."""
         self._viewers.append(sink)
-
-    def now_ns(self) -> int:
-        """Return the time by which the age of a played message is computed."""
-        return self._playback.now_ns()
-
-    @property
-    def duration_s(self) -> float:
-        """The time from the first to the last message, in s."""
-        return self._playback.duration_s
-
-    @property
-    def position_s(self) -> float:
-        """The time since the first message, in s; set by :meth:`seek`."""
-        return self._playback.position_s
-
-    @property
-    def session(self) -> int:
-        """The number of the session; a start, a seek and a loop increase it."""
-        return self._playback.session
-
-    @property
-    def is_paused(self) -> bool:
-        """True while the player waits for :meth:`resume` or :meth:`step`."""
-        return self._playback.is_paused
-
-    @property
-    def rate(self) -> float:
-        """The seconds of the log in a second; set it to play faster or slower."""
-        return self._playback.rate
-
-    @rate.setter
-    def rate(self, rate: float) -> None:
-        self._playback.rate = rate
-
-    @property
-    def loop(self) -> bool:
-        """True to begin again at the end; it can be set."""
-        return self._playback.loop
-
-    @loop.setter
-    def loop(self, loop: bool) -> None:
-        self._playback.loop = loop
-
-    def pause(self) -> None:
-        """Hold the playback."""
-        self._playback.pause()
-
-    def resume(self) -> None:
-        """Continue after a pause."""
-        self._playback.resume()
-
-    def step(self) -> None:
-        """Pause, and play the messages of the next capture time."""
-        self._playback.step()
-
-    def seek(self, position_s: float) -> None:
-        """Continue at a time since the first message, in s."""
-        self._playback.seek(position_s)
-
-    def stop(self) -> None:
-        """End the playback."""
-        self._playback.stop()
 
     def wait(self) -> None:
         """Wait until the log has ended, or until :meth:`stop`."""
         while not self._ended.wait(_TURN_S):
             pass
 
+    def _open(
+        self, logs: Sequence[tuple[Session, PlayedTopics]], options: PlaybackOptions, clock: Clock | None
+    ) -> None:
+        def read(start_ns: int | None = None) -> Iterator[Message]:
+            streams = (session.messages(chosen.topics, start_ns) for session, chosen in logs)
+            return heapq.merge(*streams, key=lambda message: message.log_time_ns)
+
+        first_ns = next(in_capture_order(read())).publish_time_ns
+        last_ns = max(session.last(chosen.topics)[1] for session, chosen in logs)
+        super().__init__(read, first_ns, last_ns, options, clock)
+
     def _play(self, tracker: Tracker) -> list[Outcome]:
         try:
-            tracker.begin(self._playback.stop)
-            with FanOut([*self._streams, *self._viewers, tracker], self._warn) as show:
-                for message in chain(self._first, self._playback):
+            tracker.begin(self.stop)
+            with FanOut([*self.streams, *self._viewers, tracker], self._warn) as show:
+                for message in chain(self._first, self.messages()):
                     show(message)
             show.check()
         finally:
@@ -334,15 +274,3 @@ def _viewer(
 
     cameras = [name for name, topic in session.images.items() if topic in chosen.topics]
     return LiveView(rig, cameras, chosen.run, say, page.show, page.name)
-
-
-def _open_playback(
-    logs: Sequence[tuple[Session, PlayedTopics]], options: PlaybackOptions | None, clock: Clock | None
-) -> Playback:
-    def read(start_ns: int | None = None) -> Iterator[Message]:
-        streams = (session.messages(chosen.topics, start_ns) for session, chosen in logs)
-        return heapq.merge(*streams, key=lambda message: message.log_time_ns)
-
-    first_ns = next(in_capture_order(read())).publish_time_ns
-    last_ns = max(session.last(chosen.topics)[1] for session, chosen in logs)
-    return Playback(read, first_ns, last_ns, options, clock)

@@ -58,7 +58,7 @@ def check_rate(rate: float) -> None:
 
 
 class Playback:
-    """The messages of logs, each at its time. An iterable; other threads may control it.
+    """The messages of logs, each at its time; other threads may control them.
 
     Each start, seek and loop begins with a message of `NewSession`: the receivers forget earlier poses.
 
@@ -68,6 +68,11 @@ class Playback:
     first_ns, last_ns : the capture times of the first and the last message.
     clock : the clock of the playback.
     wait : waits for a change, at most some seconds; a test replaces it.
+
+    Attributes
+    ----------
+    session : the number of the session; a start, a seek and a loop increase it.
+    loop : begin again at the end; it can be set.
 
     Raises
     ------
@@ -160,7 +165,8 @@ class Playback:
         """Return the time by which the age of a played message is computed."""
         return self._clock.now_ns() if self._options.restamp else self._time_ns()
 
-    def __iter__(self) -> Iterator[Message]:
+    def messages(self) -> Iterator[Message]:
+        """Yield the messages, each at its time."""
         while (start_ns := self._begin()) is not None:
             yield Message("", start_ns, start_ns, NewSession(self.session))
             for message in in_capture_order(self._read(start_ns)):

@@ -166,22 +166,12 @@ class _Bag:
         self._now_ns = message.payload.timestamp
         self.known.update(track.robot for track in message.payload.tracks)
         poses = list(self._poses.read(message))
-        sent = [
-            (pose, pose.track.heading_rad)
-            for pose in poses
-            if pose.is_good and pose.track.heading_rad is not None and is_stampable(pose.time_ns)
-        ]
+        sent = ros2.sendable(poses)
         self.poses += len(sent)
         self.left_out += len(poses) - len(sent)
         log_ns, time_ns = message.log_time_ns, message.payload.timestamp
-        if sent:
-            self._put("/tf", ros2.TF, log_ns, time_ns, ros2.encode_transforms(sent))
-        for pose, heading_rad in sent:
-            robot = pose.track.robot
-            self._put(f"/{robot}/pose", ros2.POSE, log_ns, time_ns, ros2.encode_pose(pose, heading_rad))
-            if pose.velocity is not None:
-                data = ros2.encode_odometry(pose, heading_rad, pose.velocity)
-                self._put(f"/{robot}/odom", ros2.ODOMETRY, log_ns, time_ns, data)
+        for topic, ros_type, data in ros2.encode_poses(sent):
+            self._put(topic, ros_type, log_ns, time_ns, data)
 
     def _put(
         self, topic: str, ros_type: str, log_ns: int, time_ns: int, data: bytes, is_latched: bool = False

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import threading
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from types import NoneType, TracebackType
+from types import NoneType
 from typing import Protocol, runtime_checkable
 
 from ipsys_log.messages import CompressedImage, CompressedVideo, Message, RawImage, SkippedVideo
@@ -94,22 +94,14 @@ class LiveQueue:
 
     If the sink is too slow, images are dropped first; of a video, all frames up to the next keyframe. Tracks
     and all other messages are dropped last.
-
-    Attributes
-    ----------
-    dropped : number of dropped messages by the last part of their topic, such as ``image``.
     """
 
     def __init__(self) -> None:
-        self.dropped: Counter[str] = Counter()
         self._waiting: deque[Message] = deque()
         self._changed = threading.Condition()
         self._closed = False
         # Cameras whose video continues with a keyframe only.
         self._broken: set[str | None] = set()
-
-    def __len__(self) -> int:
-        return len(self._waiting)
 
     def put(self, message: Message) -> bool:
         """Enqueue a message; return False if it is dropped."""
@@ -117,7 +109,6 @@ class LiveQueue:
             if self._closed:
                 return True
             if self._is_dropped(message):
-                self.dropped[message.topic.rpartition("/")[2]] += 1
                 return False
             self._waiting.append(message)
             self._changed.notify()
@@ -187,16 +178,18 @@ class FanOut:
             worker.thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         for worker in self._workers:
             worker.queue.close()
         for worker in self._workers:
             worker.finish()
 
-    def __call__(self, message: Message) -> None:
-        """Hand a message to each sink."""
+    def __call__(self, *messages: Message) -> None:
+        """Hand messages to each sink, one after the other."""
+        for message in messages:
+            self._show(message)
+
+    def _show(self, message: Message) -> None:
         if isinstance(message.payload, SkippedVideo):
             message = replace(message, payload=message.payload.frame)
         for outlet in tuple(self._outlets):
@@ -214,7 +207,8 @@ class FanOut:
 
     def _report(self, name: str, fault: Exception) -> None:
         self._fault = self._fault or fault
-        self._warn("sink_stopped", f"{name} stopped ({_text_of(fault)}); the recording continues")
+        text = " ".join(str(fault).split()) or type(fault).__name__
+        self._warn("sink_stopped", f"{name} stopped ({text}); the recording continues")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -256,11 +250,3 @@ class _Worker:
         except Exception as fault:  # any error: the frames are more important
             self.queue.close()
             self._report(self._sink.name, fault)
-
-
-def _text_of(fault: Exception) -> str:
-    """Return the text of an error on one line; its type if it has no text."""
-    try:
-        return " ".join(str(fault).split()) or type(fault).__name__
-    except Exception:  # an error without a text
-        return type(fault).__name__

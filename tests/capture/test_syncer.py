@@ -100,7 +100,7 @@ def test_recording_is_synced_without_being_asked() -> None:
 def test_recording_syncs_while_it_is_open(tmp_path: Path) -> None:
     synced = threading.Event()
     with open_recording(tmp_path / "a.mcap") as log:
-        log.sync(lambda fault: synced.set() if fault is None else None)
+        log.syncer.soon(lambda fault: synced.set() if fault is None else None)
         assert synced.wait(LIMIT_S)
 
 
@@ -191,7 +191,7 @@ def test_deleted_log_ends_the_recording(tmp_path: Path) -> None:
     def source() -> Generator[Message | None, None, None]:
         yield frame(0)
         path.unlink()
-        log.sync(lambda _: checked.set())
+        log.syncer.soon(lambda _: checked.set())
         assert checked.wait(LIMIT_S)
         yield frame(1)
 

@@ -173,7 +173,7 @@ def test_a_file_is_played_in_real_time(tmp_path: Path, ipsys: Ipsys, monkeypatch
     assert ipsys("import", "videos", f"red={video}", "-o", log).code == 0
     for source, name in ((f"file:{video}", "red"), (f"file:{log}", "red"), (f"file:{log}?red", "left")):
         clock = SleptClock()
-        monkeypatch.setattr("ipsys_log.capture.video_files.time.sleep", clock.sleep)
+        monkeypatch.setattr("ipsys_log.capture.frames.time.sleep", clock.sleep)
         start_ns = clock.ns
         came = play(source, name, clock)
         assert (clock.ns - start_ns) / 1e9 == pytest.approx(0.75, abs=0.001)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ipsys_log.capture.simulation.calibration_points import SimulatedPose
-from ipsys_log.capture.simulation.cameras import Camera, aim_cameras, mount_cameras
+from ipsys_log.capture.simulation.cameras import Camera, mount_cameras
 from ipsys_log.capture.simulation.drive import Drive, plan_drive
 from ipsys_log.capture.simulation.settings import LabSettings, Purpose, random_stream
 from ipsys_log.errors import IpsysError
@@ -19,6 +19,7 @@ from ipsys_log.vision.markers import marker_corners
 from ipsys_log.vision.poses import transform
 from tests.geometric.points import choose_points
 from tests.geometric.smooth_fields import SmoothField, SmoothSignal
+from tests.geometric.tilted_cameras import aim_cameras
 
 # Kinds of intrinsics that the user has.
 INTRINSICS = ("true", "calibrated", "nominal")
@@ -179,9 +180,15 @@ class GeometricLab:
 
     def drive_poses(self, marker_id: int, times_s: Array) -> PlacedMarkers:
         """Return the true poses of a robot's marker at times (n,) in s after the start of the drive."""
-        path = self.drive.poses_over(marker_id, times_s)
+        path = poses_over(self.drive, marker_id, times_s)
         poses = np.insert(path, 2, self.robot_heights_m[marker_id], axis=1)
         return self.place(poses, self.wobble[marker_id].at(times_s))
+
+
+def poses_over(drive: Drive, marker_id: int, times_s: Array) -> Array:
+    """Return x, y and heading of one marker at times (n,) after the start: (n, 3), in m and rad."""
+    (x_m, y_m), (dx, dy) = drive.follow(marker_id, np.maximum(times_s, 0.0))
+    return np.stack([x_m, y_m, np.arctan2(dy, dx)], axis=1)
 
 
 def build_lab(settings: GeometricSettings) -> GeometricLab:

@@ -14,7 +14,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Markers, Rig
 from ipsys_log.messages.rig_file import check_rig
 from tests.conftest import Ipsys
-from tests.geometric.lab import GeometricSettings, build_lab
+from tests.geometric.lab import GeometricSettings, build_lab, poses_over
 from tests.geometric.session import simulate_session
 
 
@@ -56,7 +56,7 @@ def test_robots_of_a_hall_pass_every_camera() -> None:
     drive = plan_drive(hall, mount_cameras(hall))
     assert len(drive.ahead_s) == 12
     times_s = np.linspace(0, hall.drive_s, 61)
-    paths_m = [np.insert(drive.poses_over(n, times_s)[:, :2], 2, hall.drive_height_m, 1) for n in range(12)]
+    paths_m = [np.insert(poses_over(drive, n, times_s)[:, :2], 2, hall.drive_height_m, 1) for n in range(12)]
     for camera in mount_cameras(hall):
         assert sum(sees(camera, path_m).any() for path_m in paths_m) >= 2
 

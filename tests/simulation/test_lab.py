@@ -238,17 +238,3 @@ def test_default_lab_has_the_documented_contents() -> None:
     counts: Counter[str] = Counter(m.topic for m in simulate(LabSettings(drive_s=2.0)))
     assert counts["/cameras/red/image"] == counts["/truth/tracks"] > 200
     assert counts["/measurements"] > 100
-
-
-@pytest.mark.parametrize("speed_m_s", [0.26, 1.0])
-def test_velocity_of_a_drive_is_the_slope_of_its_path(speed_m_s: float) -> None:
-    settings = LabSettings(seed=4, markers=2, drive_speed_m_s=speed_m_s)
-    drive, step_s = plan_drive(settings, mount_cameras(settings)), 1e-3
-    # The times include the acceleration at the start and a second lap of the path.
-    times_s = np.linspace(0.01, 1.2 * drive.times_s[-1], 500)
-    for marker_id in drive.ahead_s:
-        after, before = (drive.poses_over(marker_id, times_s + side * step_s / 2) for side in (1, -1))
-        slopes_m_s = (after - before)[:, :2] / step_s
-        velocities_m_s = drive.velocities_over(marker_id, times_s)
-        assert np.abs(velocities_m_s - slopes_m_s).max() < 1e-3 * speed_m_s
-    assert drive.velocities_over(0, np.array([-1.0, 0.0])).tolist() == [[0.0, 0.0], [0.0, 0.0]]

@@ -8,10 +8,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
-from ipsys_log.capture.simulation.calibration_points import place_marker
+from ipsys_log.capture.simulation.calibration_points import place_marker, plan_points
 from ipsys_log.capture.simulation.cameras import Camera, mount_cameras, prepare_view
 from ipsys_log.capture.simulation.drive import Drive, plan_drive
-from ipsys_log.capture.simulation.lab import EPOCH_NS, drive_start_ns, simulate
+from ipsys_log.capture.simulation.lab import EPOCH_NS, simulate, start_of_set_ns
 from ipsys_log.capture.simulation.render import expose
 from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.messages import CameraCalibration, CompressedImage, Message, Rig, Tracks
@@ -154,7 +154,11 @@ def session() -> list[Message]:
 def drive_of(settings: LabSettings) -> tuple[Drive, int, dict[str, Camera]]:
     cameras = mount_cameras(settings, EPOCH_NS)
     named = {camera.name: camera for camera in cameras}
-    return plan_drive(settings, cameras), drive_start_ns(settings, cameras), named
+    return (
+        plan_drive(settings, cameras),
+        start_of_set_ns(settings, len(plan_points(settings, cameras))),
+        named,
+    )
 
 
 def test_ground_truth_has_the_time_of_the_frame(session: list[Message]) -> None:

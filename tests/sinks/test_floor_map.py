@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from ipsys_log.messages import Floor, ReferencePoint, Rig, Track, Tracks
-from ipsys_log.sinks.video.floor_map import FloorMap, MapLook, MapPart
+from ipsys_log.sinks.video.floor_map import FloorMap, Scene
 
 S = 1_000_000_000
 RED, BLUE = (250, 20, 20), (20, 20, 250)
-LOOK = MapLook((600, 600), 14, {"ada": RED, "bob": BLUE}, 1, S)
-PART = MapPart((0.0, 0.0), (4.0, 4.0))
 RIG = Rig(
     "lab", "DICT_4X4_100", 0.2, reference_points=(ReferencePoint("A", 3.0, 1.0),), floor=Floor(4.0, 4.0)
 )
+SCENE = Scene((), {"ada": RED, "bob": BLUE}, RIG, np.zeros(2), np.full(2, 4.0), 1, S, "poly")
+SIZE_PX, FONT_PX = (600, 600), 14
 ADA = Track("ada", 0, 1.0, 1.0, 0.0, 0.0)
 
 
@@ -32,7 +32,7 @@ def is_red(colour: tuple[int, ...]) -> bool:
 
 @pytest.fixture
 def floor_map() -> FloorMap:
-    return FloorMap(RIG, PART, LOOK)
+    return FloorMap(SCENE, SIZE_PX, FONT_PX)
 
 
 def test_robot_has_a_disc_and_an_arrow_ahead(floor_map: FloorMap) -> None:
@@ -72,18 +72,18 @@ def test_trail_has_a_gap_where_the_robot_was_not_seen(floor_map: FloorMap) -> No
 def test_robot_disappears_when_its_pose_is_old(floor_map: FloorMap) -> None:
     floor_map.add(Tracks(S, (ADA,)), S)
     assert not is_red(colour_at(floor_map, floor_map.draw(3 * S), 1.0, 1.0))
-    assert np.array_equal(floor_map.draw(60 * S), FloorMap(RIG, PART, LOOK).draw(60 * S))
+    assert np.array_equal(floor_map.draw(60 * S), FloorMap(SCENE, SIZE_PX, FONT_PX).draw(60 * S))
 
 
 def test_unknown_robots_and_damaged_poses_are_not_drawn(floor_map: FloorMap) -> None:
     floor_map.add(Tracks(S, (replace(ADA, robot="eve"), replace(ADA, x_m=float("nan")))), S)
-    assert np.array_equal(floor_map.draw(S), FloorMap(RIG, PART, LOOK).draw(S))
+    assert np.array_equal(floor_map.draw(S), FloorMap(SCENE, SIZE_PX, FONT_PX).draw(S))
 
 
 def test_reference_point_is_a_cross_at_its_place(floor_map: FloorMap) -> None:
     picture = floor_map.draw(S)
     assert min(colour_at(floor_map, picture, 3.0, 1.0)) > 150
-    bare = FloorMap(None, PART, LOOK)
+    bare = FloorMap(replace(SCENE, rig=None), SIZE_PX, FONT_PX)
     assert max(colour_at(bare, bare.draw(S), 3.0, 1.03)) < 80
 
 

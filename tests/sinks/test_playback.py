@@ -32,7 +32,7 @@ def playback(clock: WaitingClock, log: Sequence[Message] = LOG, **options: Any) 
     return Playback(read, min(times_ns), max(times_ns), chosen, clock, clock.wait)
 
 
-def times_of(messages: Iterator[Message] | Playback, clock: WaitingClock) -> list[tuple[int, int]]:
+def times_of(messages: Iterator[Message], clock: WaitingClock) -> list[tuple[int, int]]:
     """Return the capture time of each played message, and the time of its playing; both from the start."""
     start_ns = clock.now_ns()
     return [
@@ -45,7 +45,7 @@ def times_of(messages: Iterator[Message] | Playback, clock: WaitingClock) -> lis
 @pytest.mark.parametrize("rate", [0.5, 1.0, 2.0])
 def test_messages_have_the_spacing_of_their_capture_times(rate: float) -> None:
     clock = WaitingClock()
-    played = times_of(playback(clock, rate=rate), clock)
+    played = times_of(playback(clock, rate=rate).messages(), clock)
     assert [captured for captured, _ in played] == [number * STEP_NS for number in range(50)]
     assert max(abs(at_ns - captured / rate) for captured, at_ns in played) < 1000
 
@@ -55,7 +55,7 @@ def test_late_messages_are_played_at_their_capture_time() -> None:
     log.sort(key=lambda message: message.log_time_ns)
     assert [message.publish_time_ns for message in log] != sorted(m.publish_time_ns for m in log)
     clock = WaitingClock()
-    assert times_of(playback(clock, log), clock) == [(n * STEP_NS, n * STEP_NS) for n in range(5)]
+    assert times_of(playback(clock, log).messages(), clock) == [(n * STEP_NS, n * STEP_NS) for n in range(5)]
 
 
 def test_message_logged_long_after_its_capture_is_played() -> None:
@@ -81,7 +81,7 @@ def test_capture_order_reads_little_ahead() -> None:
 def test_pause_stops_time_and_step_plays_one_instant() -> None:
     clock = WaitingClock()
     player = playback(clock, start_paused=True)
-    played = iter(player)
+    played = player.messages()
     assert isinstance(next(played).payload, NewSession)
     player.step()
     assert next(played) is LOG[0]
@@ -99,7 +99,7 @@ def test_pause_stops_time_and_step_plays_one_instant() -> None:
 def test_seek_and_loop_begin_a_new_session() -> None:
     clock = WaitingClock()
     player = playback(clock, loop=True)
-    played = iter(player)
+    played = player.messages()
     sessions, first = [next(played).payload.number], next(played)
     player.seek(1.0)
     sessions.append(next(played).payload.number)
@@ -116,7 +116,7 @@ def test_seek_and_loop_begin_a_new_session() -> None:
 def test_restamped_messages_have_the_times_of_the_playback() -> None:
     clock = WaitingClock()
     player = playback(clock, restamp=True, rate=2.0)
-    for message in player:
+    for message in player.messages():
         if not isinstance(message.payload, NewSession):
             assert message.publish_time_ns == clock.now_ns() == player.now_ns()
             assert message.payload.timestamp == message.publish_time_ns
@@ -125,7 +125,7 @@ def test_restamped_messages_have_the_times_of_the_playback() -> None:
 def test_change_of_rate_keeps_the_position() -> None:
     clock = WaitingClock()
     player = playback(clock)
-    played = iter(player)
+    played = player.messages()
     next(message for message in played if message is LOG[10])
     player.rate = 0.5
     start_ns = clock.now_ns()
@@ -194,5 +194,5 @@ def test_restamp_moves_the_log_time_too() -> None:
     clock = WaitingClock()
     log = [replace(message) for message in LOG[:3]]
     player = playback(clock, log, restamp=True)
-    played = [message for message in player if not isinstance(message.payload, NewSession)]
+    played = [message for message in player.messages() if not isinstance(message.payload, NewSession)]
     assert [m.log_time_ns - m.publish_time_ns for m in played] == [30_000_000] * 3

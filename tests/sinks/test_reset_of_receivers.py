@@ -46,7 +46,7 @@ class Receivers:
         self._reader = Reader(stack.enter_context(socket.create_connection(("127.0.0.1", vrpn), _LIMIT_S)))
         self._reader.greet()
         wait_until(
-            lambda: any(getattr(stream, "client_count", 0) for stream in self.player._streams),
+            lambda: any(getattr(stream, "client_count", 0) for stream in self.player.streams),
             "the VRPN client is connected",
         )
         self.ros2 = stack.enter_context(closing(ZenohListener(ros2, "/clock", "/ada/pose")))

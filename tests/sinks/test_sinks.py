@@ -101,15 +101,7 @@ def test_slow_sink_loses_images_before_tracks() -> None:
     messages = drained(waiting)
     assert len([m for m in messages if isinstance(m.payload, Tracks)]) == 90
     images = [m for m in messages if isinstance(m.payload, CompressedImage)]
-    assert waiting.dropped == {"image": 150 - len(images)}
     assert 0 < len(images) <= 100
-
-
-def test_waiting_messages_are_bounded() -> None:
-    waiting = LiveQueue()
-    for number in range(1000):
-        waiting.put(tracks(number))
-    assert (len(waiting), waiting.dropped["tracks"]) == (200, 800)
 
 
 def test_inline_sink_gets_messages_before_the_call_returns() -> None:

@@ -14,7 +14,7 @@ import pytest
 from ipsys_log.capture.simulation.calibration_points import SimulatedPose, cameras_seeing, place_marker
 from ipsys_log.capture.simulation.cameras import Camera, FloorView, mount_cameras, prepare_view
 from ipsys_log.capture.simulation.drive import plan_drive
-from ipsys_log.capture.simulation.lab import EPOCH_NS, drive_start_ns, simulate
+from ipsys_log.capture.simulation.lab import EPOCH_NS, simulate, start_of_set_ns
 from ipsys_log.capture.simulation.render import encode_jpeg, render
 from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.messages import CameraCalibration, CompressedImage, Marker, RigCamera, Tracks
@@ -114,7 +114,7 @@ ROLLING = LabSettings(
 def test_rolling_shutter_markers_are_at_their_exposure_position() -> None:
     """Robots have 2 m/s and 1/60 s of motion blur; the speed is known from the third sighting."""
     cameras = mount_cameras(ROLLING)
-    drive, start_ns = plan_drive(ROLLING, cameras), drive_start_ns(ROLLING, cameras)
+    drive, start_ns = plan_drive(ROLLING, cameras), start_of_set_ns(ROLLING, 0)
     row_s = ROLLING.row_time_ns / NS_PER_S
     following = {c.name: MarkerTracker(ROLLING.dictionary, c.lens, None, row_s) for c in cameras}
     times_seen: Counter[tuple[str, int]] = Counter()

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ipsys_log.capture.simulation.calibration_points import plan_points
 from ipsys_log.capture.simulation.cameras import mount_cameras
-from ipsys_log.capture.simulation.lab import drive_start_ns, simulate
+from ipsys_log.capture.simulation.lab import simulate, start_of_set_ns
 from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.engine.output import write_log
 from ipsys_log.engine.request import Request
@@ -136,7 +137,7 @@ def rolling(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def drive_error_m(log: Path, rig: Rig | None) -> float:
     """Return the mean track error on the drive, with a model that reads no depths."""
     fused = replay([log], Request(models=("rayplane",), rig=rig))[-1]
-    start_ns = drive_start_ns(ROLLING, mount_cameras(ROLLING))
+    start_ns = start_of_set_ns(ROLLING, len(plan_points(ROLLING, mount_cameras(ROLLING))))
     with Session([log]) as session:
         made = list(session.messages(session.topics(TRACKS, fused.run)))
         tracks = gather_tracks(m for m in made if m.publish_time_ns >= start_ns)

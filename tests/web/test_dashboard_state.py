@@ -7,6 +7,7 @@ import json
 import math
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -159,11 +160,11 @@ def test_recording_has_its_size_and_the_time_that_the_disk_lasts(lab: LiveLab, t
 
 
 class Stream:
-    name, client_count, dropped_count = "VRPN port 3883", 2, 7
+    name, client_count, drops = "VRPN port 3883", 2, SimpleNamespace(count=7)
 
 
 class Sender:
-    name, dropped_count = "UDP 9870", 0
+    name, drops = "UDP 9870", SimpleNamespace(count=0)
 
 
 def test_streams_have_their_clients_and_dropped_messages(tmp_path: Path) -> None:

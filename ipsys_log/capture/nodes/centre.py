@@ -14,19 +14,23 @@ from contextlib import contextmanager
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 from ipsys_log.capture.frames import Clock, Frame, Say, SourceError, SourceMessage
 from ipsys_log.capture.nodes.network import AUTHORITY, NodeNetwork, open_centre_session
 from ipsys_log.capture.nodes.stream import NodeStream
-from ipsys_log.capture.nodes.wire import FrameHeader, NodeState, frames_key, missing_key, state_key
+from ipsys_log.capture.nodes.wire import (
+    FrameHeader,
+    NodeState,
+    decode_text,
+    encode_text,
+    frames_key,
+    missing_key,
+    state_key,
+)
 from ipsys_log.messages import RigCamera
 from ipsys_log.messages.rig_file import check_name
 from ipsys_log.units import NS_PER_S
-
-if TYPE_CHECKING:
-    import zenoh
 
 _SCHEME = "zenoh:"
 _MOST_WAITING_BYTES = 64 << 20
@@ -129,24 +133,20 @@ class Centre:
     Raises
     ------
     IpsysError
-        On entering: the centre cannot listen.
+        The centre cannot listen.
     """
 
     def __init__(self, cameras: Sequence[RigCamera], network: NodeNetwork, version: str) -> None:
         self._nodes = {camera.name: node_of(camera) for camera in cameras}
         self._network, self._version = network, version
-        self._session: zenoh.Session | None = None
+        self._session: Any = open_centre_session(network, list(self._nodes.values()))
         self._links: dict[str, _Link] = {}
 
     def __enter__(self) -> Self:
-        self._session = open_centre_session(self._network, list(self._nodes.values()))
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self._session is not None:
-            self._session.close()  # type: ignore[no-untyped-call]
+    def __exit__(self, *_: object) -> None:
+        self._session.close()
 
     @contextmanager
     def open(
@@ -295,7 +295,7 @@ class _Link:
 
         def receive(reply: Any) -> None:
             back_ns = self._clock.now_ns()
-            state = NodeState.decode(reply.ok.payload.to_bytes()) if reply.ok is not None else None
+            state = decode_text(NodeState, reply.ok.payload.to_bytes()) if reply.ok is not None else None
             if state is not None:
                 self._exchanges += 1
                 self._put(0, partial(self._stream.take_state, state, sent_ns, back_ns))
@@ -303,7 +303,7 @@ class _Link:
         self._session.get(
             state_key(self._node),
             _directly(receive),
-            payload=self._stream.state_request().encode(),
+            payload=encode_text(self._stream.state_request()),
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
             priority=zenoh.Priority.INTERACTIVE_HIGH,
@@ -322,7 +322,7 @@ class _Link:
         self._session.get(
             missing_key(self._node),
             zenoh.handlers.Callback(self._receive_late, self._end_late),
-            payload=request.encode(),
+            payload=encode_text(request),
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
             congestion_control=zenoh.CongestionControl.BLOCK,

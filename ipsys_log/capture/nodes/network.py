@@ -264,8 +264,6 @@ def open_centre_session(network: NodeNetwork, cameras: Sequence[str]) -> zenoh.S
     IpsysError
         The port is in use, the host is not this machine, or a certificate is missing or not valid.
     """
-    import zenoh
-
     files = network.files_of(CENTRE)
     _check_free(network)
     settings = {"listen/endpoints": [network.endpoint], "connect/endpoints": []}
@@ -274,7 +272,7 @@ def open_centre_session(network: NodeNetwork, cameras: Sequence[str]) -> zenoh.S
         rules += _rules(camera, "ingress", "egress")
         subjects.append({"id": camera} | ({} if files is None else {"cert_common_names": [camera]}))
         policies.append({"rules": [f"data_{camera}", f"ask_{camera}"], "subjects": [camera]})
-    return _open(zenoh, settings, files, rules, subjects, policies, network)
+    return _open(settings, files, rules, subjects, policies, network)
 
 
 def open_node_session(network: NodeNetwork, camera: str) -> zenoh.Session:
@@ -285,8 +283,6 @@ def open_node_session(network: NodeNetwork, camera: str) -> zenoh.Session:
     IpsysError
         A certificate is missing or not valid.
     """
-    import zenoh
-
     files = network.files_of(camera)
     settings = {
         "listen/endpoints": [],
@@ -297,7 +293,7 @@ def open_node_session(network: NodeNetwork, camera: str) -> zenoh.Session:
     }
     subjects = [{"id": CENTRE} | ({} if files is None else {"cert_common_names": [CENTRE]})]
     policies = [{"rules": [f"data_{camera}", f"ask_{camera}"], "subjects": [CENTRE]}]
-    return _open(zenoh, settings, files, _rules(camera, "egress", "ingress"), subjects, policies, network)
+    return _open(settings, files, _rules(camera, "egress", "ingress"), subjects, policies, network)
 
 
 def _rules(camera: str, data_flow: str, ask_flow: str) -> list[dict[str, Any]]:
@@ -316,7 +312,6 @@ def _rules(camera: str, data_flow: str, ask_flow: str) -> list[dict[str, Any]]:
 
 
 def _open(
-    library: Any,
     settings: dict[str, Any],
     files: Certificates | None,
     rules: list[dict[str, Any]],
@@ -324,6 +319,8 @@ def _open(
     policies: list[dict[str, Any]],
     network: NodeNetwork,
 ) -> zenoh.Session:
+    import zenoh
+
     settings = {
         **settings,
         "mode": "peer",
@@ -344,14 +341,13 @@ def _open(
     }
     if files is not None:
         settings["transport/link/tls"] = _tls(files)
-    config = library.Config()
+    config = zenoh.Config()
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
     try:
-        session: Any = library.open(config)
-    except library.ZError as error:
+        return zenoh.open(config)
+    except zenoh.ZError as error:
         raise IpsysError(f"[nodes] centre {network}: the connection cannot be opened ({error})") from error
-    return session  # type: ignore[no-any-return]
 
 
 def _tls(files: Certificates) -> dict[str, Any]:

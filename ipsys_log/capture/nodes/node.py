@@ -5,7 +5,6 @@ import threading
 from collections import OrderedDict, deque
 from pathlib import Path
 from queue import Empty, Full, Queue
-from types import TracebackType
 from typing import Any, NamedTuple, Self
 
 from ipsys_log.capture.frames import Clock, Say
@@ -16,9 +15,10 @@ from ipsys_log.capture.nodes.wire import (
     FrameRequest,
     NodeState,
     StateRequest,
+    decode_text,
+    encode_text,
     frames_key,
     missing_key,
-    new_session,
     state_key,
 )
 from ipsys_log.errors import IpsysError
@@ -83,7 +83,7 @@ class Node:
         say: Say,
         sends_markers: bool = False,
     ) -> None:
-        self.session_name = new_session(secrets.token_bytes(_SESSION_BYTES))
+        self.session_name = secrets.token_hex(_SESSION_BYTES)
         self._camera, self._network, self._version = camera, network, version
         self._clock, self._say = clock, say
         self._log = log
@@ -130,9 +130,7 @@ class Node:
             )
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._stopped.set()
         with self._changed:
             self._changed.notify_all()
@@ -218,7 +216,7 @@ class Node:
         """Answer a request for the state; Zenoh calls this in its thread."""
         received_ns = self._clock.now_ns()
         with query:
-            request = StateRequest.decode(query.payload.to_bytes()) if query.payload is not None else None
+            request = decode_text(StateRequest, bytes(query.payload or b""))
             if request is None:
                 return
             self._note_centre(request, received_ns)
@@ -230,7 +228,7 @@ class Node:
                 self._count,
                 self._has_ended,
             )
-            query.reply(state_key(self._camera), state.encode(), express=True)
+            query.reply(state_key(self._camera), encode_text(state), express=True)
 
     def _note_centre(self, request: StateRequest, now_ns: int) -> None:
         self._asked_ns = now_ns
@@ -284,7 +282,7 @@ class Node:
                 self._check_later_centre()
                 continue
             with query:
-                request = FrameRequest.decode(query.payload.to_bytes()) if query.payload is not None else None
+                request = decode_text(FrameRequest, bytes(query.payload or b""))
                 if request is not None and request.session == self.session_name:
                     self._answer_frames(query, request)
 

@@ -10,7 +10,6 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from multiprocessing.connection import Connection
-from types import TracebackType
 from typing import Any, NamedTuple, Self
 
 from ipsys_log.capture.frames import Clock, Frame, Open, Say, SourceError, SourceMessage
@@ -47,13 +46,6 @@ class _Setup(NamedTuple):
     version: str
 
 
-class _Opening(NamedTuple):
-    """The request to open the camera of a node; the clock is that of the recording."""
-
-    camera: str
-    clock: Clock
-
-
 class Receiver:
     """The cameras of nodes, received in a process of its own. A context manager.
 
@@ -87,9 +79,7 @@ class Receiver:
         self._start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._end()
 
     def choose_opener(self, other: Open) -> Open:
@@ -119,7 +109,7 @@ class Receiver:
     def _items(self, camera: RigCamera, clock: Clock, say: Say) -> Iterator[Frame | SourceMessage | None]:
         arrived, has_answered = self._arrived[camera.name], False
         arrived.clear()
-        self._send(_Opening(camera.name, clock))
+        self._send(camera.name, clock)
         while True:
             if not arrived:
                 self._look()
@@ -152,8 +142,8 @@ class Receiver:
         except (EOFError, OSError):
             self._fail()
 
-    def _send(self, opening: _Opening) -> None:
-        """Send a request to the process, and start it again if it has ended."""
+    def _send(self, camera: str, clock: Clock) -> None:
+        """Request a camera of the process, and start the process again if it has ended."""
         if self._process is None:
             try:
                 self._start()
@@ -161,7 +151,7 @@ class Receiver:
                 raise SourceError(str(error)) from error
         assert self._process is not None
         try:
-            self._process.sender.send(opening)
+            self._process.sender.send((camera, clock))
         except OSError:
             self._fail()
 

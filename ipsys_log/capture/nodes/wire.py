@@ -5,12 +5,10 @@ times, and for frames that did not arrive. All messages are untrusted: a message
 None.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import struct
-from typing import Any, NamedTuple, get_type_hints
+from typing import Any, NamedTuple, Self, TypeVar, get_type_hints
 
 _PREFIX = "ipsys"
 _HEADER = struct.Struct("<4s8sQqB")
@@ -45,11 +43,6 @@ def missing_key(camera: str) -> str:
     return f"{_PREFIX}/{camera}/missing"
 
 
-def new_session(random_bytes: bytes) -> str:
-    """Return the name of a session of a node, from 8 random bytes."""
-    return random_bytes.hex()
-
-
 class FrameHeader(NamedTuple):
     """The header of a frame.
 
@@ -68,7 +61,7 @@ class FrameHeader(NamedTuple):
         return _HEADER.pack(_MAGIC, session, self.number, self.time_ns, FORMATS.index(self.format))
 
     @classmethod
-    def decode(cls, data: bytes) -> FrameHeader | None:
+    def decode(cls, data: bytes) -> Self | None:
         """Return the header in some bytes; None if they are none.
 
         Examples
@@ -95,16 +88,6 @@ class StateRequest(NamedTuple):
     session: str
     received: int
 
-    def encode(self) -> bytes:
-        """Return the request as JSON."""
-        return json.dumps(self._asdict()).encode()
-
-    @classmethod
-    def decode(cls, data: bytes) -> StateRequest | None:
-        """Return the request in some bytes; None if they are none."""
-        values = _read(data, cls)
-        return None if values is None else cls(**values)
-
 
 class NodeState(NamedTuple):
     """The answer of a node: its version, its session, and the times of the exchange by its clock.
@@ -119,23 +102,6 @@ class NodeState(NamedTuple):
     recorded: int
     has_ended: bool
 
-    def encode(self) -> bytes:
-        """Return the answer as JSON."""
-        return json.dumps(self._asdict()).encode()
-
-    @classmethod
-    def decode(cls, data: bytes) -> NodeState | None:
-        """Return the answer in some bytes; None if they are none.
-
-        Examples
-        --------
-        >>> state = NodeState("0.1.0", "00112233445566ff", 5, 6, 2, False)
-        >>> NodeState.decode(state.encode()) == state, NodeState.decode(b"{}")
-        (True, None)
-        """
-        values = _read(data, cls)
-        return None if values is None else cls(**values)
-
 
 class FrameRequest(NamedTuple):
     """A request for frames of a session, from the number ``first`` to the number before ``end``."""
@@ -144,19 +110,24 @@ class FrameRequest(NamedTuple):
     first: int
     end: int
 
-    def encode(self) -> bytes:
-        """Return the request as JSON."""
-        return json.dumps(self._asdict()).encode()
 
-    @classmethod
-    def decode(cls, data: bytes) -> FrameRequest | None:
-        """Return the request in some bytes; None if they are none."""
-        values = _read(data, cls)
-        return None if values is None else cls(**values)
+Text = TypeVar("Text", StateRequest, NodeState, FrameRequest)
 
 
-def _read(data: bytes, kind: Any) -> dict[str, Any] | None:
-    """Return the fields of a message in JSON; None if it is not valid."""
+def encode_text(message: StateRequest | NodeState | FrameRequest) -> bytes:
+    """Return a message as JSON."""
+    return json.dumps(message._asdict()).encode()
+
+
+def decode_text(kind: type[Text], data: bytes) -> Text | None:
+    """Return the message of a kind in some bytes of JSON; None if they are none.
+
+    Examples
+    --------
+    >>> state = NodeState("0.1.0", "00112233445566ff", 5, 6, 2, False)
+    >>> decode_text(NodeState, encode_text(state)) == state, decode_text(NodeState, b"{}")
+    (True, None)
+    """
     if len(data) > _LONGEST_TEXT:
         return None
     try:
@@ -166,7 +137,8 @@ def _read(data: bytes, kind: Any) -> dict[str, Any] | None:
     types = get_type_hints(kind)
     if not isinstance(values, dict) or values.keys() != types.keys():
         return None
-    return values if all(_is_valid(name, value, types[name]) for name, value in values.items()) else None
+    is_valid = all(_is_valid(name, value, types[name]) for name, value in values.items())
+    return kind(**values) if is_valid else None
 
 
 def _is_valid(name: str, value: Any, kind: type) -> bool:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.capture.simulation.settings import FLOOR_M, LabSettings, Purpose, random_stream
+from ipsys_log.capture.simulation.settings import FLOOR_M, HALL_SPACING_M, LabSettings, Purpose, random_stream
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Array, CameraCalibration
 from ipsys_log.vision.lenses import project, undistort
@@ -58,41 +58,29 @@ def mount_cameras(settings: LabSettings, time_ns: int = 0) -> tuple[Camera, ...]
     if settings.grid is not None:
         return tuple(
             _mount(settings, index, middle_m, _cell_of_floor(settings, middle_m), time_ns)
-            for index, middle_m in enumerate(_grid_middles(*settings.grid, settings.spacing_m))
+            for index, middle_m in enumerate(_grid_middles(*settings.grid))
         )
-    count = len(settings.cameras)
-    spacing_m = (FLOOR_M - 2 * _FROM_WALL_M) / max(count - 1, 2)
-    ys_m = FLOOR_M / 2 + spacing_m * (np.arange(count) - (count - 1) / 2)
+    ys_m, spacing_m = row_of_cameras(len(settings.cameras))
     return tuple(
         _mount(settings, index, (FLOOR_M / 2, y_m), _part_of_floor(settings, y_m, spacing_m), time_ns)
         for index, y_m in enumerate(ys_m.tolist())
     )
 
 
-def _grid_middles(columns: int, rows: int, spacing_m: tuple[float, float]) -> list[tuple[float, float]]:
+def row_of_cameras(count: int) -> tuple[Array, float]:
+    """Return the y of cameras in a row above the floor, (count,), and the distance of two of them, in m."""
+    spacing_m = (FLOOR_M - 2 * _FROM_WALL_M) / max(count - 1, 2)
+    ys_m = np.asarray(FLOOR_M / 2 + spacing_m * (np.arange(count) - (count - 1) / 2), dtype=np.float64)
+    return ys_m, spacing_m
+
+
+def _grid_middles(columns: int, rows: int) -> list[tuple[float, float]]:
     """Return the middles of the parts of the floor, column after column, in m."""
     return [
-        ((column + 0.5) * spacing_m[0], (row + 0.5) * spacing_m[1])
+        ((column + 0.5) * HALL_SPACING_M[0], (row + 0.5) * HALL_SPACING_M[1])
         for column in range(columns)
         for row in range(rows)
     ]
-
-
-def aim_cameras(settings: LabSettings, time_ns: int = 0) -> tuple[Camera, ...]:
-    """Return cameras with large tilts, each aimed at the point of the floor below its place in the row.
-
-    A camera with a tilt of t stands ``height * tan(t)`` beside its place, at most at the walls.
-    :func:`mount_cameras` refuses such tilts, because a tilted camera does not see its part of the floor.
-
-    Parameters
-    ----------
-    settings : settings of the lab.
-    time_ns : time of the calibrations.
-    """
-    count = len(settings.cameras)
-    spacing_m = (FLOOR_M - 2 * _FROM_WALL_M) / max(count - 1, 2)
-    ys_m = FLOOR_M / 2 + spacing_m * (np.arange(count) - (count - 1) / 2)
-    return tuple(_aim(settings, index, float(y_m), time_ns) for index, y_m in enumerate(ys_m))
 
 
 def sees(camera: Camera, points_m: Array) -> NDArray[np.bool_]:
@@ -113,37 +101,20 @@ def _mount(
     rng = random_stream(settings.seed, Purpose.CAMERA, index)
     name = settings.cameras[index]
     for _ in range(_TRIES):
-        lens = _draw_lens(rng, settings, name, time_ns)
+        lens = draw_lens(rng, settings, name, time_ns)
         tilt = np.radians(rng.uniform(*settings.tilt_deg))
         towards = rng.uniform(0, 2 * np.pi)
         tilt_rad = tilt * np.array([np.cos(towards), np.sin(towards), 0.0])
         nudge_m = rng.uniform(-1, 1, 3) * [0.02, 0.02, 0.04]
         origin_m = np.array([*place_m, settings.mount_height_m]) + nudge_m
         camera = Camera(name, lens, look_down(origin_m, tilt_rad))
-        if _reaches(lens) and sees(camera, wanted_m).all():
+        if reaches(lens) and sees(camera, wanted_m).all():
             return camera
     raise IpsysError(
         f"simulator: camera {name!r} cannot see its part of the floor from {settings.mount_height_m:g} m "
         f"with a tilt of {settings.tilt_deg[0]:g} to {settings.tilt_deg[1]:g} degrees; "
         "tilt it less, hang it higher, or use a frame of 16:9 and lower markers"
     )
-
-
-def _aim(settings: LabSettings, index: int, y_m: float, time_ns: int) -> Camera:
-    rng = random_stream(settings.seed, Purpose.GEOMETRY, index)
-    name = settings.cameras[index]
-    for _ in range(_TRIES):
-        lens = _draw_lens(rng, settings, name, time_ns)
-        if _reaches(lens):
-            break
-    tilt = np.radians(rng.uniform(*settings.tilt_deg))
-    towards = rng.uniform(0, 2 * np.pi)
-    axis = np.array([np.cos(towards), np.sin(towards), 0.0])
-    aside = look_down(np.zeros(3), tilt * axis)[2, :3]
-    place_m = np.array([FLOOR_M / 2, y_m]) + settings.mount_height_m * aside[:2] / aside[2]
-    nudge_m = rng.uniform(-1, 1, 3) * [0.02, 0.02, 0.04]
-    origin_m = np.append(np.clip(place_m, 0.0, FLOOR_M), settings.mount_height_m) + nudge_m
-    return Camera(name, lens, look_down(origin_m, tilt * axis))
 
 
 def _part_of_floor(settings: LabSettings, y_m: float, spacing_m: float) -> Array:
@@ -172,14 +143,15 @@ def _cell_of_floor(settings: LabSettings, middle_m: tuple[float, float]) -> Arra
     """
     top_m = max(*settings.heights_m, settings.drive_height_m)
     beyond_m = settings.marker_length_m / np.sqrt(2) + _BEYOND_M
-    reach_m = np.array(settings.spacing_m) / 2 + beyond_m
+    reach_m = np.array(HALL_SPACING_M) / 2 + beyond_m
     share = np.linspace(-1, 1, 9)
     edge = np.array([(x, y) for x in share for y in share if max(abs(x), abs(y)) == 1])
     flat_m = np.clip(middle_m + edge * reach_m, 0.0, settings.floor_m)
     return np.column_stack([flat_m, np.full(len(flat_m), top_m)])
 
 
-def _draw_lens(rng: np.random.Generator, settings: LabSettings, name: str, time_ns: int) -> CameraCalibration:
+def draw_lens(rng: np.random.Generator, settings: LabSettings, name: str, time_ns: int) -> CameraCalibration:
+    """Draw the intrinsics of a camera; their distortion is about that of the lenses in the paper."""
     scale = settings.width / 1920
     fx = scale * rng.uniform(*_FOCAL_PX)
     fy = fx * rng.uniform(0.998, 1.002)
@@ -194,7 +166,7 @@ def _draw_lens(rng: np.random.Generator, settings: LabSettings, name: str, time_
     )
 
 
-def _reaches(lens: CameraCalibration) -> bool:
+def reaches(lens: CameraCalibration) -> bool:
     """Return whether the lens distortion is monotone up to an angle outside the image."""
     theta = np.linspace(0, _WIDEST_RAD, 200)
     powers = theta[:, None] ** np.array([2, 4, 6, 8])

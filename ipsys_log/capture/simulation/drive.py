@@ -1,12 +1,12 @@
-"""Convoy of robots on a smooth closed path over the whole floor, at full speed or with stops.
+"""Convoy of robots on a smooth closed path over the whole floor.
 
 The path does not cross itself, so the robots of a convoy never meet, for any duration.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -16,78 +16,8 @@ from ipsys_log.capture.simulation.cameras import Camera
 from ipsys_log.capture.simulation.settings import FLOOR_M, LabSettings, Purpose, random_stream
 from ipsys_log.messages import Array
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Stops:
-    """The stops of a robot.
-
-    Attributes
-    ----------
-    legs_s, stands_s : mean durations of a leg and of a stand, above 0; they have exponential distributions.
-    acceleration_m_s2 : of each start, and of each braking, above 0.
-    """
-
-    legs_s: float
-    stands_s: float
-    acceleration_m_s2: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Pace:
-    """The speed of a robot, as a share of full speed: linear between knots, constant after the last one.
-
-    Attributes
-    ----------
-    times_s : (n,), of the knots, from 0 on.
-    shares : (n,), of full speed, at the knots.
-    """
-
-    times_s: Array
-    shares: Array
-
-    def share_at(self, times_s: Array) -> Array:
-        """Return the shares of full speed (n,) at times (n,)."""
-        return np.interp(times_s, self.times_s, self.shares)
-
-    def driven_s(self, times_s: Array) -> Array:
-        """Return the ways since the start (n,) at times (n,), as the time for them at full speed."""
-        steps_s = np.diff(self.times_s)
-        ends_s = np.concatenate([[0.0], np.cumsum(steps_s * (self.shares[1:] + self.shares[:-1]) / 2)])
-        knot = np.maximum(np.searchsorted(self.times_s, times_s, side="right") - 1, 0)
-        since_s = times_s - self.times_s[knot]
-        return np.asarray(ends_s[knot] + since_s * (self.shares[knot] + self.share_at(times_s)) / 2)
-
-
-def draw_pace(stops: Stops, speed_m_s: float, duration_s: float, rng: np.random.Generator) -> Pace:
-    """Draw the pace of a robot: it drives at full speed at the start, and stops again and again.
-
-    Parameters
-    ----------
-    stops : its stops.
-    speed_m_s : its full speed.
-    duration_s : the drive has stops until this time.
-    rng : random numbers.
-
-    Examples
-    --------
-    >>> stops = Stops(legs_s=6.0, stands_s=2.0, acceleration_m_s2=2.5)
-    >>> pace = draw_pace(stops, 0.26, 600.0, np.random.default_rng(0))
-    >>> round(float(pace.driven_s(np.array([600.0]))[0] / 600), 2)
-    0.76
-    """
-    ramp_s, knots = speed_m_s / stops.acceleration_m_s2, [(0.0, 1.0)]
-    time_s = rng.exponential(stops.legs_s)
-    while time_s < duration_s:
-        stands_s = rng.exponential(stops.stands_s)
-        knots += [(time_s, 1.0), (time_s + ramp_s, 0.0)]
-        knots += [(time_s + ramp_s + stands_s, 0.0), (time_s + 2 * ramp_s + stands_s, 1.0)]
-        time_s += 2 * ramp_s + stands_s + rng.exponential(stops.legs_s)
-    times_s, shares = np.array(knots).T
-    return Pace(times_s, shares)
-
-
 # Time constant of the acceleration of a robot.
-_START_S = 0.4
+START_S = 0.4
 _TRIES = 200
 # Largest rate of turn. A robot slows down in bends to keep below it.
 _TURN_RAD_S = 2.5
@@ -112,8 +42,7 @@ class Drive:
     """A path over the floor, and the start of each marker on it.
 
     ``ahead_s`` is the time from the start of the path to the start of each marker, in s. ``times_s`` (n,) are
-    the times at which a robot passes the angles ``phases_rad`` (n,) of the path. A marker in ``paces`` does
-    not drive at full speed all the time, and can meet others.
+    the times at which a robot passes the angles ``phases_rad`` (n,) of the path.
     """
 
     height_m: float
@@ -121,11 +50,6 @@ class Drive:
     ahead_s: dict[int, float]
     times_s: Array
     phases_rad: Array
-    paces: Mapping[int, Pace] = field(default_factory=dict)
-
-    def mirror(self) -> Drive:
-        """Return the drive along the mirrored path."""
-        return replace(self, path=replace(self.path, mirrored=not self.path.mirrored))
 
     def poses_at(self, time_s: float) -> tuple[SimulatedPose, ...]:
         """Return the poses of all markers at a time after the start; before it, they are stationary."""
@@ -133,51 +57,30 @@ class Drive:
 
     def pose_at(self, marker_id: int, time_s: float) -> SimulatedPose:
         """Return the pose of one marker at a time after the start."""
-        (x_m, y_m), (dx, dy) = self._follow(marker_id, np.array([max(time_s, 0.0)]))
+        (x_m, y_m), (dx, dy) = self.follow(marker_id, np.array([max(time_s, 0.0)]))
         heading_rad = float(np.arctan2(dy[0], dx[0]))
         return SimulatedPose(marker_id, float(x_m[0]), float(y_m[0]), self.height_m, heading_rad)
 
-    def poses_over(self, marker_id: int, times_s: Array) -> Array:
-        """Return x, y and heading of one marker at times (n,) after the start: (n, 3), in m and rad."""
-        (x_m, y_m), (dx, dy) = self._follow(marker_id, np.maximum(times_s, 0.0))
-        return np.stack([x_m, y_m, np.arctan2(dy, dx)], axis=1)
-
-    def velocities_over(self, marker_id: int, times_s: Array) -> Array:
-        """Return the exact velocities of one marker at times (n,) after the start: (n, 2), in m/s."""
-        pace = self.paces.get(marker_id)
-        way_s = self._way_s(self.ahead_s[marker_id], np.maximum(times_s, 0.0), pace)
-        interval = np.clip(np.searchsorted(self.times_s, way_s, side="right"), 1, len(self.times_s) - 1) - 1
-        by_way = (np.diff(self.phases_rad) / np.diff(self.times_s))[interval]
-        # The robot accelerates: its way on the path grows by this share of the time.
-        share = np.where(times_s > 0, 1 - np.exp(-np.maximum(times_s, 0.0) / _START_S), 0.0)
-        if pace is not None:
-            share = share * pace.share_at(eased_s(times_s))
-        _, (dx, dy) = self.path.at(self._phase(way_s))
-        return np.stack([dx, dy], axis=1) * (by_way * share)[:, None]
-
     def track(self, ahead_s: float, times_s: Array) -> Array:
         """Return the centres of a marker at times (n,): (n, 3) in m."""
-        (x_m, y_m), _ = self.path.at(self._phase(self._way_s(ahead_s, times_s)))
+        (x_m, y_m), _ = self._points(ahead_s + eased_s(times_s))
         return np.stack([x_m, y_m, np.full_like(x_m, self.height_m)], axis=1)
 
-    def _follow(self, marker_id: int, times_s: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-        way_s = self._way_s(self.ahead_s[marker_id], times_s, self.paces.get(marker_id))
-        return self.path.at(self._phase(way_s))
+    def follow(self, marker_id: int, times_s: Array) -> Points:
+        """Return the points of a marker at times (n,) after the start, and their derivatives by the angle."""
+        return self._points(self.way_s(marker_id, times_s))
 
-    def _way_s(self, ahead_s: float, times_s: Array, pace: Pace | None = None) -> Array:
-        """Return the place on the path (n,), as the time from its start to there at full speed."""
-        driven_s = eased_s(times_s)
-        if pace is not None:
-            driven_s = pace.driven_s(driven_s)
-        return np.asarray((ahead_s + driven_s) % self.times_s[-1])
+    def way_s(self, marker_id: int, times_s: Array) -> Array:
+        """Return the way of one marker since the start of the path (n,), as the time for it at full speed."""
+        return self.ahead_s[marker_id] + eased_s(times_s)
 
-    def _phase(self, way_s: Array) -> Array:
-        return np.interp(way_s, self.times_s, self.phases_rad)
+    def _points(self, way_s: Array) -> Points:
+        return self.path.at(np.interp(way_s % self.times_s[-1], self.times_s, self.phases_rad))
 
 
 def eased_s(times_s: Array) -> Array:
     """Return the ways (n,) of a robot that never stops, as the time for them at full speed."""
-    driven_s: Array = times_s - _START_S * (1 - np.exp(-times_s / _START_S))
+    driven_s: Array = times_s - START_S * (1 - np.exp(-times_s / START_S))
     return driven_s
 
 

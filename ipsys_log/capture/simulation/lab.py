@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from ipsys_log.capture.simulation.calibration_points import (
@@ -117,28 +118,12 @@ def build_rig(settings: LabSettings) -> Rig:
     )
 
 
-def drive_start_ns(settings: LabSettings, cameras: Sequence[Camera]) -> int:
-    """Return the start time of the robots.
-
-    The true poses at a time are ``drive.places_at`` of the seconds since this start.
-
-    Parameters
-    ----------
-    settings : settings of the lab.
-    cameras : from :func:`~ipsys_log.capture.simulation.cameras.mount_cameras`.
-
-    Returns
-    -------
-    The time of the first frame of the drive, in ns.
-
-    Examples
-    --------
-    >>> lab = LabSettings(stations=0, drive_s=2.0, markers=1)
-    >>> cameras = mount_cameras(lab)
-    >>> (drive_start_ns(lab, cameras) - EPOCH_NS) / NS_PER_S
-    1.0
-    """
-    return _start_ns(settings, len(plan_points(settings, cameras)))
+def live_cameras(settings: LabSettings) -> tuple[RigCamera, ...]:
+    """Return the cameras of the lab for a rig file, each with its source."""
+    return tuple(
+        RigCamera(name, None, None, f"sim:{name}", settings.width, settings.height, settings.rate_hz)
+        for name in settings.cameras
+    )
 
 
 def _payloads(
@@ -158,26 +143,22 @@ def _payloads(
         instants = list(_instants(settings, cameras))
         for index, instant in enumerate(instants):
             progress("simulate", index * len(views), len(instants) * len(views))
-            yield TRUTH_TOPIC, _truth(instant, rig, cameras, settings), instant.time_ns, None
-            for image in pool.map(_Shutter(settings, instant, index), range(len(views)), views):
+            truth = true_tracks(instant.time_ns, instant.places, rig.robot_of, cameras, settings)
+            yield TRUTH_TOPIC, truth, instant.time_ns, None
+            for image in pool.map(partial(_photograph, settings, instant, index), range(len(views)), views):
                 yield image_topic(image.frame_id), image, instant.time_ns, image.frame_id
             for measurement in instant.measured:
                 yield MEASUREMENTS_TOPIC, measurement, measurement.timestamp, None
         progress("simulate", len(instants) * len(views), len(instants) * len(views))
 
 
-@dataclass(frozen=True, slots=True)
-class _Shutter:
-    """The renderer of the frames of an instant; the frames do not depend on the threads."""
-
-    settings: LabSettings
-    instant: Instant
-    index: int
-
-    def __call__(self, number: int, view: FloorView) -> CompressedImage:
-        rng = random_stream(self.settings.seed, Purpose.FRAME, number, self.index)
-        data = encode_jpeg(render(view, self.instant.prints, self.settings, rng), self.settings)
-        return CompressedImage(self.instant.time_ns, view.camera.name, data, "jpeg")
+def _photograph(
+    settings: LabSettings, instant: Instant, index: int, number: int, view: FloorView
+) -> CompressedImage:
+    """Render the frame of a camera at an instant; it does not depend on the threads."""
+    rng = random_stream(settings.seed, Purpose.FRAME, number, index)
+    data = encode_jpeg(render(view, instant.prints, settings, rng), settings)
+    return CompressedImage(instant.time_ns, view.camera.name, data, "jpeg")
 
 
 def _instants(settings: LabSettings, cameras: Sequence[Camera]) -> Iterator[Instant]:
@@ -186,7 +167,7 @@ def _instants(settings: LabSettings, cameras: Sequence[Camera]) -> Iterator[Inst
     for number, points in enumerate(sets):
         places = tuple(point.pose for point in points)
         lying = tuple(place_marker(pose, settings) for pose in places)
-        times_ns = _times(settings, _start_ns(settings, number), settings.frames_per_station)
+        times_ns = _times(settings, start_of_set_ns(settings, number), settings.frames_per_station)
         first = number * settings.markers
         measured = tuple(
             measure(pose, settings, index, times_ns, splits[index])
@@ -195,7 +176,7 @@ def _instants(settings: LabSettings, cameras: Sequence[Camera]) -> Iterator[Inst
         for time_ns in times_ns[:-1]:
             yield Instant(time_ns, places, lying)
         yield Instant(times_ns[-1], places, lying, measured)
-    drive, start_ns = plan_drive(settings, cameras), _start_ns(settings, len(sets))
+    drive, start_ns = plan_drive(settings, cameras), start_of_set_ns(settings, len(sets))
     for time_ns in _times(settings, start_ns, round(settings.drive_s * settings.rate_hz)):
         time_s = (time_ns - start_ns) / NS_PER_S
         prints = tuple(moving_marker(drive, marker_id, time_s, settings) for marker_id in drive.ahead_s)
@@ -207,7 +188,7 @@ def moving_marker(drive: Drive, marker_id: int, time_s: float, settings: LabSett
     return lambda since_s: place_marker(drive.pose_at(marker_id, time_s + since_s), settings)
 
 
-def _start_ns(settings: LabSettings, number: int) -> int:
+def start_of_set_ns(settings: LabSettings, number: int) -> int:
     """Return the first time of a set of calibration points; after the last set, the start of the drive."""
     last_ns = _times(settings, 0, settings.frames_per_station)[-1]
     return EPOCH_NS + NS_PER_S + number * (last_ns + _PAUSE_NS)
@@ -217,12 +198,19 @@ def _times(settings: LabSettings, start_ns: int, count: int) -> list[int]:
     return [start_ns + round(index * NS_PER_S / settings.rate_hz) for index in range(count)]
 
 
-def _truth(instant: Instant, rig: Rig, cameras: Sequence[Camera], settings: LabSettings) -> Tracks:
+def true_tracks(
+    time_ns: int,
+    places: Sequence[SimulatedPose],
+    robot_of: Callable[[int], str],
+    cameras: Sequence[Camera],
+    settings: LabSettings,
+) -> Tracks:
+    """Return the ground truth of markers at an instant; ``robot_of`` returns the robot of a marker."""
     return Tracks(
-        instant.time_ns,
+        time_ns,
         tuple(
             Track(
-                robot=rig.robot_of(pose.marker_id),
+                robot=robot_of(pose.marker_id),
                 id=pose.marker_id,
                 x_m=pose.x_m,
                 y_m=pose.y_m,
@@ -230,6 +218,6 @@ def _truth(instant: Instant, rig: Rig, cameras: Sequence[Camera], settings: LabS
                 heading_rad=pose.heading_rad,
                 cameras=cameras_seeing(pose, cameras, settings),
             )
-            for pose in instant.places
+            for pose in places
         ),
     )

@@ -23,11 +23,11 @@ from ipsys_log.capture.simulation.calibration_points import (
 )
 from ipsys_log.capture.simulation.cameras import Camera, Check, FloorView, mount_cameras, prepare_view, sees
 from ipsys_log.capture.simulation.drive import Drive, eased_s, plan_drive
-from ipsys_log.capture.simulation.lab import build_rig, moving_marker
+from ipsys_log.capture.simulation.lab import build_rig, live_cameras, moving_marker
 from ipsys_log.capture.simulation.render import Print, add_static_prints, encode_jpeg, render
 from ipsys_log.capture.simulation.settings import LabSettings, Purpose, random_stream
 from ipsys_log.errors import IpsysError
-from ipsys_log.messages import Array, Rig, RigCamera, RigMarker
+from ipsys_log.messages import Array, Rig, RigMarker
 from ipsys_log.messages.rig_checks import dictionary_size
 from ipsys_log.units import CM_PER_M
 from ipsys_log.vision.lenses import undistort
@@ -250,12 +250,8 @@ def live_rig(settings: LabSettings) -> Rig:
     """Return the rig of the live lab: each camera with its source, each marker with its height."""
     rig = build_rig(settings)
     stationary = plan_live_lab(settings).stationary
-    cameras = (
-        RigCamera(name, None, None, f"sim:{name}", settings.width, settings.height, settings.rate_hz)
-        for name in settings.cameras
-    )
     still = (RigMarker(pose.marker_id, height_m=pose.z_m) for pose in stationary)
-    return replace(rig, cameras=tuple(cameras), markers=(*rig.markers, *still))
+    return replace(rig, cameras=live_cameras(settings), markers=(*rig.markers, *still))
 
 
 def tape_sheet(stationary: Sequence[SimulatedPose]) -> str:

@@ -9,12 +9,12 @@ from math import atan2, cos, exp, sin, sqrt
 
 import numpy as np
 
-from ipsys_log.capture.simulation.calibration_points import SimulatedPose, cameras_seeing, place_marker
+from ipsys_log.capture.simulation.calibration_points import SimulatedPose, place_marker
 from ipsys_log.capture.simulation.cameras import FloorView, mount_cameras, prepare_view
-from ipsys_log.capture.simulation.lab import build_rig
+from ipsys_log.capture.simulation.lab import build_rig, live_cameras, true_tracks
 from ipsys_log.capture.simulation.render import add_static_prints, encode_jpeg, render
 from ipsys_log.capture.simulation.settings import LabSettings, Purpose, random_stream
-from ipsys_log.messages import Rig, RigCamera, Track, Tracks, Waypoint
+from ipsys_log.messages import Rig, Tracks, Waypoint
 from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.markers import MovingMarker, PlacedBoard
 from ipsys_log.vision.poses import pose_facing_up
@@ -159,12 +159,8 @@ class RobotStart:
 def robot_rig(settings: LabSettings) -> Rig:
     """Return the rig of the lab: as many robots as markers, and the simulated cameras."""
     rig = build_rig(settings)
-    cameras = (
-        RigCamera(name, None, None, f"sim:{name}", settings.width, settings.height, settings.rate_hz)
-        for name in settings.cameras
-    )
     markers = (replace(marker, height_m=settings.drive_height_m) for marker in rig.markers)
-    return replace(rig, cameras=tuple(cameras), markers=tuple(markers))
+    return replace(rig, cameras=live_cameras(settings), markers=tuple(markers))
 
 
 class RobotLab:
@@ -223,21 +219,7 @@ class RobotLab:
     def truth_at(self, time_ns: int) -> Tracks:
         """Return the ground truth at a time."""
         names = {marker_id: name for name, marker_id in self._ids.items()}
-        return Tracks(
-            time_ns,
-            tuple(
-                Track(
-                    names[pose.marker_id],
-                    pose.marker_id,
-                    pose.x_m,
-                    pose.y_m,
-                    pose.z_m,
-                    pose.heading_rad,
-                    cameras=cameras_seeing(pose, self.cameras, self.settings),
-                )
-                for pose in self.poses_at(time_ns)
-            ),
-        )
+        return true_tracks(time_ns, self.poses_at(time_ns), names.__getitem__, self.cameras, self.settings)
 
     def draw(self, number: int, frame: int, time_ns: int) -> bytes:
         """Return the JPEG of a camera for a frame; the robots must have moved to the end of its exposure."""

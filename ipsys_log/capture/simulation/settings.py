@@ -18,7 +18,7 @@ from ipsys_log.messages.rig_file import check_name
 
 FLOOR_M = 4.88
 # Each camera of a hall has this part of the floor: 6 x 4 cameras are above 20 x 15 m.
-_HALL_SPACING_M = (20 / 6, 15 / 4)
+HALL_SPACING_M = (20 / 6, 15 / 4)
 _MOST_IN_ROW = 12
 # The cameras of a hall are higher than those of the lab, so that fields of view overlap on all sides.
 _MOUNT_HEIGHT_M = 5.0
@@ -179,16 +179,11 @@ class LabSettings:
         _check_dictionary(self.dictionary, self.markers)
 
     @property
-    def spacing_m(self) -> tuple[float, float]:
-        """The distance of two columns, and of two rows, of the cameras of a hall, in m."""
-        return _HALL_SPACING_M
-
-    @property
     def floor_m(self) -> tuple[float, float]:
         """The size of the floor along x and y, in m."""
         if self.grid is None:
             return FLOOR_M, FLOOR_M
-        return self.grid[0] * _HALL_SPACING_M[0], self.grid[1] * _HALL_SPACING_M[1]
+        return self.grid[0] * HALL_SPACING_M[0], self.grid[1] * HALL_SPACING_M[1]
 
 
 def read_settings(file: Path | None, changes: Iterable[str]) -> dict[str, Any]:

@@ -7,13 +7,12 @@ equal logs.
 from __future__ import annotations
 
 import threading
-import time
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Generator, Iterator
+from collections.abc import Collection, Generator, Iterator
 from contextlib import contextmanager, suppress
 from types import NoneType
 
-from ipsys_log.capture.frames import CameraState, Clock, Frame, Open, Say, SourceError
+from ipsys_log.capture.frames import CameraState, Clock, Frame, Say, SourceError, sleep_until
 from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.capture.simulated import FrameTiming
 from ipsys_log.capture.simulation.lab import EPOCH_NS
@@ -36,8 +35,6 @@ from ipsys_log.messages import (
 from ipsys_log.sinks.streams.poses import PoseSource
 from ipsys_log.units import NS_PER_S
 
-_REAL_TURN_S = 0.4
-
 
 class RobotCameras:
     """The cameras of a lab with robots; ``open`` is their :data:`~ipsys_log.capture.frames.Open`.
@@ -45,26 +42,22 @@ class RobotCameras:
     A frame that cannot be drawn in time is skipped. A camera that fails is lost like a real camera, and sends
     again after the failure.
 
-    Attributes
-    ----------
-    add_truth : set by the owner; called with the ground truth of each instant.
-    start_ns : the start of the drive; None before it.
+    From the start of the drive on, they add the ground truth of each instant to the recording.
     """
 
     def __init__(self, run: RobotRun, lab: RobotLab) -> None:
-        self.add_truth: Callable[[int], None] = lambda time_ns: None
-        self.start_ns: int | None = None
+        self._recording: LiveCameras | None = None
+        self._start_ns = 0
         self._run, self._lab = run, lab
         self._timing = FrameTiming.of(run.lab, None)
         self._lock, self._newest = threading.Lock(), 0
 
-    @property
-    def open(self) -> Open:
-        """The function that opens a camera."""
-        return self._open
+    def begin(self, recording: LiveCameras, start_ns: int) -> None:
+        """Begin the drive."""
+        self._recording, self._start_ns = recording, start_ns
 
     @contextmanager
-    def _open(self, camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Frame | None]]:  # noqa: ARG002
+    def open(self, camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Frame | None]]:  # noqa: ARG002
         yield self._frames(camera.name, clock)
 
     def _frames(self, name: str, clock: Clock) -> Iterator[Frame | None]:
@@ -73,10 +66,7 @@ class RobotCameras:
         while True:
             frame = max(frame + 1, timing.frame_at(clock.now_ns()))
             time_ns = round(frame * timing.period_ns)
-            while (left_s := (time_ns + timing.behind_ns - clock.now_ns()) / NS_PER_S) > 0:
-                time.sleep(min(left_s, _REAL_TURN_S))
-                if left_s > _REAL_TURN_S:
-                    yield None
+            yield from sleep_until(time_ns + timing.behind_ns, clock)
             if self._fails(name, time_ns):
                 if not was_lost:
                     raise SourceError(f"camera {name}: simulated failure")
@@ -87,9 +77,9 @@ class RobotCameras:
             yield Frame(self._lab.draw(number, frame, time_ns), "jpeg", time_ns)
 
     def _fails(self, name: str, time_ns: int) -> bool:
-        if self.start_ns is None:
+        if self._recording is None:
             return False
-        time_s = (time_ns - self.start_ns) / NS_PER_S
+        time_s = (time_ns - self._start_ns) / NS_PER_S
         return any(failure.camera == name and failure.includes(time_s) for failure in self._run.failures)
 
     def _note(self, frame: int, time_ns: int, now_ns: int) -> None:
@@ -98,8 +88,9 @@ class RobotCameras:
         with self._lock:
             is_new = frame > self._newest
             self._newest = max(frame, self._newest)
-        if is_new:
-            self.add_truth(time_ns)
+        if is_new and self._recording is not None:
+            with suppress(SourceError):  # the recording has ended
+                self._recording.add(TRUTH_TOPIC, self._lab.truth_at(time_ns))
 
 
 class Driver:
@@ -145,16 +136,6 @@ class Driver:
     def _add(self, command: WheelCommand) -> None:
         with suppress(SourceError):  # the recording has ended
             self._cameras.add(COMMANDS_TOPIC, command)
-
-
-def add_truth(cameras: LiveCameras, lab: RobotLab) -> Callable[[int], None]:
-    """Return a function that adds the ground truth of an instant to the messages of cameras."""
-
-    def add(time_ns: int) -> None:
-        with suppress(SourceError):
-            cameras.add(TRUTH_TOPIC, lab.truth_at(time_ns))
-
-    return add
 
 
 _TURN_S = 0.5

@@ -19,7 +19,6 @@ from ipsys_log.live_runs.robot_runs.robot_cameras import (
     RobotCameras,
     SimulatedClock,
     SyncPoint,
-    add_truth,
 )
 from ipsys_log.live_runs.robot_runs.settings import RobotRun, start_poses
 from ipsys_log.live_runs.robot_runs.steering import Programs, Steering, start_programs
@@ -171,9 +170,9 @@ def _drive_live(parts: _Parts) -> list[Outcome]:
         parts.connect(opened.cameras) as (streams, wheels, programs),
     ):
         cameras = opened.cameras
-        opener.add_truth = add_truth(cameras, lab)
-        opener.start_ns = clock.now_ns()
-        steering = Steering(parts.run, lab, wheels, programs, opener.start_ns, parts.say)
+        start_ns = clock.now_ns()
+        opener.begin(cameras, start_ns)
+        steering = Steering(parts.run, lab, wheels, programs, start_ns, parts.say)
         with Driver(parts.run, cameras, steering) as driver:
             outcomes = parts.live(cameras, opened.settings, streams)
         if driver.fault is not None:

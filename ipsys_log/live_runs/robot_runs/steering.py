@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 from ipsys_log.capture.simulation.robot_lab import RobotLab
 from ipsys_log.errors import IpsysError
@@ -27,19 +28,19 @@ _TURN_S, _RELAY_TURNS = 0.1, 6000
 _LOOPBACK = "127.0.0.1"
 
 
-class Programs:
+class Programs(NamedTuple):
     """The running programs of the robots.
 
-    Parameters
+    Attributes
     ----------
+    path : the file of the program.
+    processes : by robot.
     relays : the relays by robot; empty without relays.
     """
 
-    def __init__(
-        self, path: Path, processes: Mapping[str, subprocess.Popen[bytes]], relays: Mapping[str, RelayLink]
-    ) -> None:
-        self.relays = relays
-        self._path, self._processes = path, processes
+    path: Path
+    processes: Mapping[str, subprocess.Popen[bytes]]
+    relays: Mapping[str, RelayLink]
 
     def check(self) -> None:
         """Check that all programs still run.
@@ -49,10 +50,10 @@ class Programs:
         IpsysError
             A program has ended.
         """
-        for robot, process in self._processes.items():
+        for robot, process in self.processes.items():
             if process.poll() is not None:
                 raise IpsysError(
-                    f"{robot}: its program {self._path} has ended with exit code {process.returncode}; its "
+                    f"{robot}: its program {self.path} has ended with exit code {process.returncode}; its "
                     "messages are above"
                 )
 
@@ -143,17 +144,14 @@ def _start_relay(run: RobotRun, robot: str, number: int, ports: Ports, stack: Ex
 
 def _start(command: Sequence[str], stack: ExitStack, output: int | None = None) -> subprocess.Popen[bytes]:
     try:
+        # Python shows its prints at once.
+        environment = {**os.environ, "PYTHONUNBUFFERED": "1", "OPENBLAS_NUM_THREADS": "1"}
         # A group of its own: Ctrl-C in the terminal ends the simulator, and this ends its programs.
-        process = subprocess.Popen(command, stdout=output, process_group=0, env=_environment())
+        process = subprocess.Popen(command, stdout=output, process_group=0, env=environment)
     except OSError as error:
         raise IpsysError(f"{command[0]}: cannot be started: {error.strerror}; make it executable") from error
     stack.callback(_end, process)
     return process
-
-
-def _environment() -> dict[str, str]:
-    """Return the environment of a program; Python shows its prints at once."""
-    return {**os.environ, "PYTHONUNBUFFERED": "1", "OPENBLAS_NUM_THREADS": "1"}
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:

@@ -23,6 +23,7 @@ from ipsys_log.sinks.rerun.scene import (
     draw_places,
     draw_rig,
     layout,
+    open_recording,
     symbol_scale,
 )
 from ipsys_log.sinks.rerun.viewer import show_in_viewer
@@ -81,34 +82,23 @@ def write_recording(session: Session, runs: Sequence[str] = (), save: Path | Non
     return shown
 
 
-def _recording(session: Session) -> rr.RecordingStream:
-    """Return a separate stream, without the clock and the counter that Rerun adds to each message."""
-    recording = rr.RecordingStream("ipsys", send_properties=False)
-    recording.set_log_time_enabled(False)
-    recording.set_log_tick_enabled(False)
-    recording.send_recording_name(", ".join(path.stem for path in session.paths))
-    return recording
+def _name_of(session: Session) -> str:
+    return ", ".join(path.stem for path in session.paths)
 
 
 def _save(session: Session, shown: Shown, path: Path) -> None:
-    recording = _recording(session)
-    try:
+    with open_recording(_name_of(session)) as recording:
         try:
             recording.save(path)
         except RuntimeError as error:
             raise IpsysError(f"{path}: cannot be written: {error}") from error
         _draw(session, shown, recording, lambda: None)
-    finally:
-        recording.disconnect()
 
 
 def _stream(session: Session, shown: Shown, write: Callable[[bytes], object]) -> None:
-    recording = _recording(session)
-    try:
+    with open_recording(_name_of(session)) as recording:
         stream = rr.binary_stream(recording)
         _draw(session, shown, recording, lambda: write(stream.read() or b""))
-    finally:
-        recording.disconnect()
 
 
 def _draw(session: Session, shown: Shown, recording: rr.RecordingStream, sent: Callable[[], object]) -> None:

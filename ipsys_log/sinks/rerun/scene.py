@@ -2,9 +2,10 @@
 
 import heapq
 import math
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Generic, NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 import rerun as rr
@@ -52,6 +53,19 @@ class Plot(NamedTuple):
 
     title: str
     series: int
+
+
+@contextmanager
+def open_recording(name: str) -> Iterator[rr.RecordingStream]:
+    """Open a separate stream, without the clock and the counter that Rerun adds to each message."""
+    recording = rr.RecordingStream("ipsys", send_properties=False)
+    recording.set_log_time_enabled(False)
+    recording.set_log_tick_enabled(False)
+    recording.send_recording_name(name)
+    try:
+        yield recording
+    finally:
+        recording.disconnect()
 
 
 def symbol_scale(rig: Rig | None) -> float:
@@ -236,7 +250,7 @@ class Fading:
 
 
 Point = tuple[float, float, float]
-Key = TypeVar("Key", bound=Hashable)
+Key = tuple[str | None, str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,7 +270,7 @@ class _Pose:
     point_m: Point
 
 
-class Trails(Generic[Key]):
+class Trails:
     """The trails of robots: it joins the poses of each robot, and passes each segment to ``draw``.
 
     Several poses of one instant count as the last of them: tracks of earlier versions have one from each

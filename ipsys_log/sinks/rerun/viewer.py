@@ -18,7 +18,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Event, Markers, Message, Positions, Rig, Tracks, image_topic
 from ipsys_log.messages.channels import IMAGES
 from ipsys_log.sinks.rerun.messages import RerunSink, trail_entity
-from ipsys_log.sinks.rerun.scene import draw_legend, draw_rig, layout, symbol_scale
+from ipsys_log.sinks.rerun.scene import draw_legend, draw_rig, layout, open_recording, symbol_scale
 from ipsys_log.sinks.streams.poses import NewSession
 from ipsys_log.units import NS_PER_S
 
@@ -269,11 +269,7 @@ class LiveView:
 
     def _draw(self, name: str, write: Write, messages: Iterator[Message | None]) -> Message | None:
         """Draw one recording; return the message that begins the next one, None at the end."""
-        recording = rr.RecordingStream("ipsys", send_properties=False)
-        recording.set_log_time_enabled(False)
-        recording.set_log_tick_enabled(False)
-        recording.send_recording_name(name)
-        try:
+        with open_recording(name) as recording:
             stream = rr.binary_stream(recording)
             sink = self._begin(recording)
             is_empty, begun = True, None
@@ -292,8 +288,6 @@ class LiveView:
             sink.close()
             write(stream.read() or b"")
             return begun
-        finally:
-            recording.disconnect()
 
     def _begin(self, recording: rr.RecordingStream) -> RerunSink:
         trails = [] if self._run is None else [trail_entity(self._run)]

@@ -16,7 +16,7 @@ from contextlib import suppress
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
-from websockets.asyncio.server import Server, ServerConnection, broadcast, serve
+from websockets.asyncio.server import ServerConnection, broadcast, serve
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
@@ -96,7 +96,7 @@ class FoxgloveStream:
         self._listening = listen(self._host, port, "--foxglove", _BACKLOG)
         self.port: int = self._listening.getsockname()[1]
         self.name = f"Foxglove port {self.port}"
-        self._drops, self._refusals = DropReport(self.name, warn), 0
+        self.drops, self._refusals = DropReport(self.name, warn), 0
         self._channels: dict[str, Advertised] = {}
         self._latched: dict[str, tuple[int, bytes]] = {}
         # Replaced as a whole: other threads iterate over it.
@@ -123,11 +123,6 @@ class FoxgloveStream:
         """The number of clients."""
         return len(self._clients)
 
-    @property
-    def dropped_count(self) -> int:
-        """The number of messages that the stream lost."""
-        return self._drops.count
-
     def send(self, message: Message) -> None:
         """Send a message to the clients that have subscribed to its topic."""
         payload, time_ns = message.payload, message.publish_time_ns
@@ -145,7 +140,7 @@ class FoxgloveStream:
 
     def close(self) -> None:
         """Disconnect the clients and close the socket."""
-        self._drops.finish()
+        self.drops.finish()
         self._call(self._ended.set)
         self._thread.join()
         self._listening.close()
@@ -174,13 +169,9 @@ class FoxgloveStream:
             logger=_LOGGER,
         ) as server:
             await self._ended.wait()
-            self._abort(server)
-
-    @staticmethod
-    def _abort(server: Server) -> None:
-        """End all connections now: a stalled client would delay the end."""
-        for connection in server.connections:
-            connection.transport.abort()
+            # A stalled client would delay the end.
+            for connection in server.connections:
+                connection.transport.abort()
 
     def _connect(self, *arguments: Any, **options: Any) -> ServerConnection:
         """Return a new connection, and close the oldest one of too many that have sent no request."""
@@ -223,7 +214,7 @@ class FoxgloveStream:
 
     async def _handle(self, connection: ServerConnection) -> None:
         self._waiting = [other for other in self._waiting if other is not connection]
-        client = Client(connection, self._drops)
+        client = Client(connection, self.drops)
         client.put(write_server_info("ipsys", self._session, self._is_replayed))
         client.put(write_advertise(list(self._channels.values())))
         self._clients |= {client}
@@ -284,7 +275,7 @@ class Client:
 
     def __init__(self, connection: ServerConnection, drops: DropReport) -> None:
         self.subscriptions = Subscriptions()
-        self._connection, self._drops = connection, drops
+        self._connection, self.drops = connection, drops
 
     def put_message(self, channel: int, time_ns: int, data: bytes, is_image: bool) -> None:
         """Send a message of a channel if the client has subscribed to it."""
@@ -296,7 +287,7 @@ class Client:
         """Send data, or drop it if too much waits; this never blocks."""
         waiting = self._connection.transport.get_write_buffer_size()
         if waiting > (_MOST_WITH_IMAGES_BYTES if is_image else _MOST_WAITING_BYTES):
-            self._drops.add("a client is too slow")
+            self.drops.add("a client is too slow")
             return
         # A coroutine would send in the next turn of the loop, which has to wait for the GIL again.
         broadcast([self._connection], data)

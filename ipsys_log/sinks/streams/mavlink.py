@@ -196,7 +196,7 @@ class MavlinkStream:
         self.name = f"MAVLink {endpoint.robot}={endpoint.target}"
         self._encode = _MESSAGES[endpoint.message]
         self._poses, self._now_ns, self._north_rad = poses, now_ns, north_rad
-        self._drops = DropReport(self.name, warn)
+        self.drops = DropReport(self.name, warn)
         self._destination = find_destination(endpoint.target, "--mavlink")
         self._local = local_address(self._destination, host, "--mavlink")
         self._socket = open_datagrams(self._destination, self._local, "--mavlink")
@@ -217,11 +217,6 @@ class MavlinkStream:
             return f"{self.name}: only this machine"
         return f"{self.name}: sent into the network from {self._local}, not encrypted"
 
-    @property
-    def dropped_count(self) -> int:
-        """The number of messages that the stream lost."""
-        return self._drops.count
-
     def send(self, message: Message) -> None:
         """Send the poses of a message."""
         for pose in self._poses.read(message):
@@ -231,7 +226,7 @@ class MavlinkStream:
 
     def close(self) -> None:
         """Close the socket."""
-        self._drops.finish()
+        self.drops.finish()
         self._ended.set()
         for thread in self._threads:
             thread.join()
@@ -244,9 +239,9 @@ class MavlinkStream:
         try:
             self._socket.sendto(data, self._destination.address)
         except BlockingIOError:
-            self._drops.add("the system has no room for more datagrams")
+            self.drops.add("the system has no room for more datagrams")
         except OSError as error:
-            self._drops.add(str(error.strerror))
+            self.drops.add(str(error.strerror))
 
     def _beat(self) -> None:
         """Tell the autopilot once a second that this program runs."""

@@ -13,17 +13,18 @@ from ipsys_log.capture.lab import OpenLab
 from ipsys_log.extras import check_installed
 from ipsys_log.messages import RigStream
 from ipsys_log.messages.channels import TRACKS
-from ipsys_log.sinks.sink import InlineSink
+from ipsys_log.sinks.sink import DropReport, InlineSink
 from ipsys_log.sinks.streams import STREAMS, StreamSettings
 from ipsys_log.sinks.streams.poses import StreamContext, first_session
 
 
 class Stream(InlineSink, Protocol):
-    """A sink with open sockets that never waits; one with connections also has a ``client_count``."""
+    """A sink with open sockets that never waits; one with connections also has a ``client_count``.
 
-    @property
-    def dropped_count(self) -> int:
-        """The number of messages that the stream lost."""
+    ``drops`` counts the messages that the stream lost.
+    """
+
+    drops: DropReport
 
     def describe(self) -> str:
         """Return one line about the receivers of the positions."""

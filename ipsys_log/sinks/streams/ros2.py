@@ -66,14 +66,14 @@ class Ros2Stream:
         self.port, self._host, self._domain = port, host or LOOPBACK, domain
         self.name = f"ROS 2 domain {domain}"
         self._poses, self._now_ns, self._clock = poses, now_ns, Clock()
-        self._drops = DropReport(self.name, warn)
+        self.drops = DropReport(self.name, warn)
         self._newest: dict[str, StreamPose | None] = dict.fromkeys(heights_m)
-        self._number = 0
+        self._is_replayed = is_replayed
         self._ended = threading.Event()
         self.is_router = not _answers(port)
         self._session = _open_session(domain, port, host, self.is_router)
         try:
-            self._announce({name: m for name, m in heights_m.items() if m is not None}, is_replayed)
+            self._announce({name: m for name, m in heights_m.items() if m is not None})
         except BaseException:
             self._close_session()
             raise
@@ -89,14 +89,9 @@ class Ros2Stream:
             return f"{name}: only this machine"
         return f"{name}: every computer that reaches {self._host} can read the positions"
 
-    @property
-    def dropped_count(self) -> int:
-        """The number of messages that the stream lost."""
-        return self._drops.count
-
     def close(self) -> None:
         """Close the session: a program that ends without this can hang."""
-        self._drops.finish()
+        self.drops.finish()
         self._ended.set()
         self._thread.join()
         self._close_session()
@@ -104,32 +99,27 @@ class Ros2Stream:
     def _close_session(self) -> None:
         self._session.close()  # type: ignore[no-untyped-call]
 
-    def _announce(self, heights_m: Mapping[str, float], is_replayed: bool) -> None:
+    def _announce(self, heights_m: Mapping[str, float]) -> None:
         """Declare the node and its publishers."""
         self._entity = Entity(self._domain, str(self._session.info.zid()), _NODE)
         self._token = self._session.liveliness().declare_token(self._entity.node_token())
-        self._transforms = self._declare("/tf", ros2.TF, Qos(100))
-        self._diagnostics = self._declare("/diagnostics", ros2.DIAGNOSTICS)
-        self._times = self._declare("/clock", ros2.CLOCK, Qos(1, is_reliable=False)) if is_replayed else None
-        self._of_robot: dict[str, tuple[Publisher, Publisher]] = {}
+        self._publishers: dict[str, Publisher] = {}
+        self._declare("/tf", ros2.TF, Qos(100))
+        self._declare("/diagnostics", ros2.DIAGNOSTICS)
+        if self._is_replayed:
+            self._declare("/clock", ros2.CLOCK, Qos(1, is_reliable=False))
         for robot in self._newest:
-            self._publishers(robot)
+            self._declare(f"/{robot}/pose", ros2.POSE)
+            self._declare(f"/{robot}/odom", ros2.ODOMETRY)
         if heights_m:
-            self._floors = self._declare("/tf_static", ros2.TF, Qos(1, is_latched=True))
-            self._put(self._floors, ros2.encode_static(heights_m, self._now_ns()))
+            self._declare("/tf_static", ros2.TF, Qos(1, is_latched=True))
+            self._put("/tf_static", ros2.TF, ros2.encode_static(heights_m, self._now_ns()))
 
-    def _declare(self, topic: str, ros_type: str, qos: Qos | None = None) -> Publisher:
-        self._number += 1
-        return Publisher(
-            self._session, self._entity, self._number, topic, ros_type, type_hash(ros_type), qos or Qos()
+    def _declare(self, topic: str, ros_type: str, qos: Qos | None = None) -> None:
+        number = len(self._publishers) + 1
+        self._publishers[topic] = Publisher(
+            self._session, self._entity, number, topic, ros_type, type_hash(ros_type), qos or Qos()
         )
-
-    def _publishers(self, robot: str) -> tuple[Publisher, Publisher]:
-        """Return the publishers of a robot: pose, and odometry."""
-        if robot not in self._of_robot:
-            pose = self._declare(f"/{robot}/pose", ros2.POSE)
-            self._of_robot[robot] = pose, self._declare(f"/{robot}/odom", ros2.ODOMETRY)
-        return self._of_robot[robot]
 
     def send(self, message: Message) -> None:
         """Publish the poses of a message."""
@@ -138,29 +128,21 @@ class Ros2Stream:
         for pose in poses:
             if pose.track.robot in self._newest or len(self._newest) < _MOST_ROBOTS:
                 self._newest[pose.track.robot] = pose
-        sent = [
-            (pose, pose.track.heading_rad)
-            for pose in poses
-            if pose.is_good and pose.track.heading_rad is not None and is_stampable(pose.time_ns)
-        ]
-        if sent:
-            self._put(self._transforms, ros2.encode_transforms(sent))
-        for pose, heading_rad in sent:
-            with_covariance, odometry = self._publishers(pose.track.robot)
-            self._put(with_covariance, ros2.encode_pose(pose, heading_rad))
-            if pose.velocity is not None:
-                self._put(odometry, ros2.encode_odometry(pose, heading_rad, pose.velocity))
+        for topic, ros_type, data in ros2.encode_poses(ros2.sendable(poses)):
+            self._put(topic, ros_type, data)
 
-    def _put(self, publisher: Publisher, data: bytes) -> None:
+    def _put(self, topic: str, ros_type: str, data: bytes) -> None:
+        if topic not in self._publishers:
+            self._declare(topic, ros_type)
         try:
-            publisher.put(data, self._clock.now_ns())
+            self._publishers[topic].put(data, self._clock.now_ns())
         except zenoh.ZError as error:
-            self._drops.add(str(error))
+            self.drops.add(str(error))
 
     def _send_clock(self) -> None:
         now_ns = self._now_ns()
-        if self._times is not None and is_stampable(now_ns):
-            self._put(self._times, ros2.encode_clock(now_ns))
+        if self._is_replayed and is_stampable(now_ns):
+            self._put("/clock", ros2.CLOCK, ros2.encode_clock(now_ns))
 
     def _tick(self) -> None:
         """Send the clock of a replay between the positions, and once a second the diagnostics."""
@@ -172,7 +154,7 @@ class Ros2Stream:
             if number == 0 and is_stampable(now_ns):
                 newest = dict(self._newest)
                 text = ros2.encode_diagnostics(newest, self._poses.session, now_ns, self._poses.stale_s)
-                self._put(self._diagnostics, text)
+                self._put("/diagnostics", ros2.DIAGNOSTICS, text)
 
 
 def _answers(port: int) -> bool:

@@ -6,7 +6,7 @@ robot has the robot's name; its origin is the marker, and x points along the hea
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
 from math import cos, sin, sqrt
 from typing import TYPE_CHECKING, Any
@@ -102,6 +102,15 @@ def _transform(time_ns: int, parent: str, child: str, xyz_m: Iterable[float], ro
     return make("geometry_msgs/TransformStamped", make_header(time_ns, parent), child, moved)
 
 
+def sendable(poses: Iterable[StreamPose]) -> list[tuple[StreamPose, float]]:
+    """Return the poses that ROS 2 gets, with their headings in rad: current ones, inside, with a stamp."""
+    return [
+        (pose, pose.track.heading_rad)
+        for pose in poses
+        if pose.is_good and pose.track.heading_rad is not None and is_stampable(pose.time_ns)
+    ]
+
+
 def encode_transforms(poses: Iterable[tuple[StreamPose, float]]) -> bytes:
     """Return the message of ``/tf`` with poses and their headings in rad."""
     rows = []
@@ -185,6 +194,18 @@ def _covariance(known: NDArray[np.float64] | None, yaw_sigma: float | None) -> N
     if yaw_sigma is not None:
         covariance[5, 5] = yaw_sigma**2
     return covariance.ravel()
+
+
+def encode_poses(poses: Iterable[tuple[StreamPose, float]]) -> Iterator[tuple[str, str, bytes]]:
+    """Yield the messages of poses and their headings in rad, each with its topic and its type."""
+    poses = list(poses)
+    if poses:
+        yield "/tf", TF, encode_transforms(poses)
+    for pose, heading_rad in poses:
+        robot = pose.track.robot
+        yield f"/{robot}/pose", POSE, encode_pose(pose, heading_rad)
+        if pose.velocity is not None:
+            yield f"/{robot}/odom", ODOMETRY, encode_odometry(pose, heading_rad, pose.velocity)
 
 
 def encode_diagnostics(

@@ -117,7 +117,7 @@ class UdpStream:
         self._destination = find_destination(target, "--udp")
         self.name = f"UDP {target}"
         self._poses, self._key = poses, key
-        self._drops = DropReport(self.name, warn)
+        self.drops = DropReport(self.name, warn)
         self._local = local_address(self._destination, host, "--udp")
         self._socket = open_datagrams(self._destination, self._local, "--udp")
         # No program reads this socket: the smallest buffer for datagrams that others send to it.
@@ -133,11 +133,6 @@ class UdpStream:
             return f"{self.name}{signed}: every computer of this network can read the positions"
         return f"{self.name}{signed}: sent into the network from {self._local}, not encrypted"
 
-    @property
-    def dropped_count(self) -> int:
-        """The number of messages that the stream lost."""
-        return self._drops.count
-
     def send(self, message: Message) -> None:
         """Send the poses of a message."""
         for pose in self._poses.read(message):
@@ -145,16 +140,16 @@ class UdpStream:
 
     def close(self) -> None:
         """Close the socket."""
-        self._drops.finish()
+        self.drops.finish()
         self._socket.close()
 
     def _send(self, datagram: bytes) -> None:
         try:
             self._socket.sendto(datagram, self._destination.address)
         except BlockingIOError:
-            self._drops.add("the system has no room for more datagrams")
+            self.drops.add("the system has no room for more datagrams")
         except OSError as error:
-            self._drops.add(str(error.strerror))
+            self.drops.add(str(error.strerror))
 
 
 def open_all(context: StreamContext) -> Iterator[UdpStream]:

@@ -71,7 +71,7 @@ class VrpnStream:
         self._listening, self._asking = _listen(self._host, port)
         self.port: int = self._listening.getsockname()[1]
         self.name = f"VRPN port {self.port}"
-        self._drops, self._refusals = DropReport(self.name, warn), 0
+        self.drops, self._refusals = DropReport(self.name, warn), 0
         self._clock = Clock()
         # The lock guards the clients and the robots; no call within it waits.
         self._lock = threading.Lock()
@@ -96,11 +96,6 @@ class VrpnStream:
         """The number of clients that receive positions."""
         return sum(client.is_greeted for client in self._clients)
 
-    @property
-    def dropped_count(self) -> int:
-        """The number of messages that the stream lost."""
-        return self._drops.count
-
     def send(self, message: Message) -> None:
         """Send the poses of a message."""
         for pose in self._poses.read(message):
@@ -108,7 +103,7 @@ class VrpnStream:
 
     def close(self) -> None:
         """Disconnect the clients and close the sockets."""
-        self._drops.finish()
+        self.drops.finish()
         self._ended.set()
         self._wake_thread()
         self._thread.join()
@@ -127,7 +122,7 @@ class VrpnStream:
                 if client.is_greeted and not client.send(
                     pack_pose(pose, heading_rad, sender, client.count(2))
                 ):
-                    self._drops.add(f"client {client.name} is too slow")
+                    self.drops.add(f"client {client.name} is too slow")
             waiting = any(client.has_output for client in self._clients)
         if waiting:
             self._wake_thread()

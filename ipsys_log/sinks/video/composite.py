@@ -1,7 +1,5 @@
 """The pictures of a video: a panel for each camera on the left, and the map with the time on the right."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from math import ceil
 
@@ -9,10 +7,10 @@ import cv2
 import numpy as np
 
 from ipsys_log.errors import FrameError
-from ipsys_log.messages import CompressedImage, CompressedVideo, Markers, Message, RawImage, Rig, Tracks
+from ipsys_log.messages import CompressedImage, CompressedVideo, Markers, Message, RawImage, Tracks
 from ipsys_log.sinks.colours import MARKER_COLOUR, camera_colours
 from ipsys_log.sinks.video.canvas import RGB, Canvas, Picture, text_size
-from ipsys_log.sinks.video.floor_map import FloorMap, MapLook, MapPart
+from ipsys_log.sinks.video.floor_map import FloorMap, Scene
 from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.decode import decode_colour
 from ipsys_log.vision.video import Video
@@ -134,30 +132,6 @@ _FONT_SHARE = 1 / 52
 _MANY_COLUMNS = range(3, 9)
 
 
-@dataclass(frozen=True, slots=True)
-class Scene:
-    """The constant part of a video.
-
-    Attributes
-    ----------
-    cameras : the names of the cameras.
-    colours : by robot.
-    rig : the rig of the tracks, or None.
-    part : the visible part of the floor.
-    enlarged : factor on the ellipses.
-    fade_ns : a robot without a newer pose disappears after this time.
-    run : the run of the tracks.
-    """
-
-    cameras: tuple[str, ...]
-    colours: Mapping[str, RGB]
-    rig: Rig | None
-    part: MapPart
-    enlarged: int
-    fade_ns: int
-    run: str
-
-
 class Composite:
     """The picture of a video at one time: the newest content of each channel.
 
@@ -180,8 +154,7 @@ class Composite:
             self._panels[camera] = panel, (x, y)
         self._head = round(2.6 * self._font_px)
         size = width - self._left, height - self._head
-        look = MapLook(size, self._font_px, scene.colours, scene.enlarged, scene.fade_ns)
-        self.floor = FloorMap(scene.rig, scene.part, look)
+        self.floor = FloorMap(scene, size, self._font_px)
 
     def add(self, message: Message) -> None:
         """Show a message from now on."""

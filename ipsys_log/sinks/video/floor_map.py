@@ -67,32 +67,29 @@ _OLDEST = 0.18
 _CIRCLE = np.linspace(0.0, 2 * np.pi, 49)
 
 
-@dataclass(frozen=True, slots=True)
-class MapPart:
-    """The part of the floor on the map: its lowest and highest x and y in m."""
-
-    low_m: tuple[float, float]
-    high_m: tuple[float, float]
-
-
-@dataclass(frozen=True, slots=True)
-class MapLook:
-    """The look of a map.
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """The constant part of a video.
 
     Attributes
     ----------
-    size_px : width and height.
-    font_px : size of the text.
+    cameras : the names of the cameras.
     colours : by robot; other robots are not drawn.
+    rig : the rig of the tracks, with the floor and its reference points; None: the map has only the grid.
+    low_m, high_m : (2,), the lowest and the highest x and y of the visible part of the floor.
     enlarged : factor on the ellipses.
     fade_ns : a robot without a newer pose disappears after this time.
+    run : the run of the tracks.
     """
 
-    size_px: tuple[int, int]
-    font_px: int
+    cameras: tuple[str, ...]
     colours: Mapping[str, RGB]
+    rig: Rig | None
+    low_m: Array
+    high_m: Array
     enlarged: int
     fade_ns: int
+    run: str
 
 
 @dataclass(slots=True)
@@ -109,23 +106,24 @@ class FloorMap:
 
     Parameters
     ----------
-    rig : the rig, with the floor and its reference points; None: only the grid.
-    part : the visible part of the floor.
+    size_px : width and height.
+    font_px : size of the text.
     """
 
-    def __init__(self, rig: Rig | None, part: MapPart, look: MapLook) -> None:
-        self._look, self._robots = look, dict[str, _Robot]()
-        (width, height), font_px = look.size_px, look.font_px
+    def __init__(self, scene: Scene, size_px: tuple[int, int], font_px: int) -> None:
+        self._scene, self._size_px, self._font_px = scene, size_px, font_px
+        self._robots: dict[str, _Robot] = {}
+        width, height = size_px
         self._line_px = max(font_px // 7, 1)
         # Room for the numbers of the axes.
         room = np.array([width - 4.6 * font_px, height - 3.2 * font_px])
-        low, high = np.array(part.low_m), np.array(part.high_m)
+        low, high = scene.low_m, scene.high_m
         self._scale = float((room / (high - low)).min())
         self._low_m = low
         drawn = (high - low) * self._scale
         self._start_px = np.array([3.2 * font_px, 0.8 * font_px]) + (room - drawn) / 2
         self._top_px = self._start_px[1] + drawn[1]
-        self._ground = self._draw_ground(rig, low, high)
+        self._ground = self._draw_ground(scene.rig, low, high)
 
     def to_px(self, points_m: Array) -> Array:
         """Return the places (n, 2) on the map, from the centre of its first pixel, of floor points (n, 2)."""
@@ -136,7 +134,7 @@ class FloorMap:
         """Show poses of a log time from now on."""
         for track in tracks.tracks:
             numbers = [track.x_m, track.y_m, track.heading_rad or 0.0]
-            if track.robot not in self._look.colours or not np.isfinite(numbers).all():
+            if track.robot not in self._scene.colours or not np.isfinite(numbers).all():
                 continue
             robot = self._robots.setdefault(track.robot, _Robot(track, time_ns))
             robot.track, robot.time_ns = track, time_ns
@@ -149,25 +147,25 @@ class FloorMap:
         for name, robot in list(self._robots.items()):
             while robot.points and time_ns - robot.points[0][0] > _TRAIL_NS:
                 robot.points.popleft()
-            if not robot.points and time_ns - robot.time_ns > self._look.fade_ns:
+            if not robot.points and time_ns - robot.time_ns > self._scene.fade_ns:
                 del self._robots[name]
         canvas = Canvas(self._ground.copy())
         seen = {
             name: robot
             for name, robot in sorted(self._robots.items())
-            if time_ns - robot.time_ns <= self._look.fade_ns
+            if time_ns - robot.time_ns <= self._scene.fade_ns
         }
         for name, robot in sorted(self._robots.items()):
-            self._draw_trail(canvas, robot, self._look.colours[name], time_ns)
+            self._draw_trail(canvas, robot, self._scene.colours[name], time_ns)
         self._draw_ellipses(canvas, seen)
         for name, robot in seen.items():
-            self._draw_robot(canvas, robot.track, self._look.colours[name])
+            self._draw_robot(canvas, robot.track, self._scene.colours[name])
         for name, robot in seen.items():
             self._draw_name(canvas, name, robot.track)
         return canvas.picture
 
     def _draw_ground(self, rig: Rig | None, low: Array, high: Array) -> Picture:
-        width, height = self._look.size_px
+        width, height = self._size_px
         canvas = Canvas(np.full((height, width, 3), _GROUND[::-1], dtype=np.uint8))
         corners = np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
         floor = rig.floor if rig is not None else None
@@ -186,7 +184,7 @@ class FloorMap:
     def _draw_grid(self, canvas: Canvas, low: Array, high: Array) -> None:
         span = float((high - low).max())
         step = next((m for m in _STEPS_M if span / m <= _MOST_LINES), span)
-        size = self._look.font_px - 1
+        size = self._font_px - 1
         bottom = self.to_px(low[None])[0]
         for axis in (0, 1):
             first, last = int(np.ceil(low[axis] / step - 1e-9)), int(np.floor(high[axis] / step + 1e-9))
@@ -207,7 +205,7 @@ class FloorMap:
                     canvas.text((bottom[0] - width - 0.5 * size, line[0, 1] + height / 2), text, size, _TEXT)
 
     def _draw_reference(self, canvas: Canvas, name: str, point_m: Array) -> None:
-        at, arm, size = self.to_px(point_m)[0], 0.45 * self._look.font_px, self._look.font_px
+        at, arm, size = self.to_px(point_m)[0], 0.45 * self._font_px, self._font_px
         for direction in ([arm, 0.0], [0.0, arm]):
             canvas.line(np.array([at - direction, at + direction]), _REFERENCE)
         canvas.text(
@@ -225,7 +223,7 @@ class FloorMap:
         line = self.to_px(np.array([point[1:] for point in robot.points]))
         ages = (time_ns - times_ns) / _TRAIL_NS
         for n in range(1, len(line)):
-            if times_ns[n] - times_ns[n - 1] <= self._look.fade_ns:
+            if times_ns[n] - times_ns[n - 1] <= self._scene.fade_ns:
                 share = _OLDEST + (1 - _OLDEST) * max(1 - float(ages[n]), 0.0)
                 canvas.line(line[n - 1 : n + 1], _mix(colour, share), self._line_px)
 
@@ -236,10 +234,10 @@ class FloorMap:
             if track.covariance_m2 is None or not np.isfinite(track.covariance_m2).all():
                 continue
             major_m, minor_m, angle = covariance_ellipse(track.covariance_m2[:2, :2])
-            round_m = self._look.enlarged * np.stack([major_m * np.cos(_CIRCLE), minor_m * np.sin(_CIRCLE)])
+            round_m = self._scene.enlarged * np.stack([major_m * np.cos(_CIRCLE), minor_m * np.sin(_CIRCLE)])
             turn = np.array([[cos(angle), -sin(angle)], [sin(angle), cos(angle)]])
             outline = self.to_px((turn @ round_m).T + np.array([track.x_m, track.y_m]))
-            outlines.append((outline, self._look.colours[name]))
+            outlines.append((outline, self._scene.colours[name]))
         filled = Canvas(canvas.picture.copy())
         for outline, colour in outlines:
             filled.fill(outline, colour)
@@ -250,7 +248,7 @@ class FloorMap:
             canvas.line(outline, colour)
 
     def _draw_robot(self, canvas: Canvas, track: Track, colour: RGB) -> None:
-        radius = 0.5 * self._look.font_px
+        radius = 0.5 * self._font_px
         at = self.to_px(np.array([[track.x_m, track.y_m]]))[0]
         if track.heading_rad is not None:
             ahead = np.array([cos(track.heading_rad), -sin(track.heading_rad)])
@@ -267,15 +265,15 @@ class FloorMap:
             canvas.disc(at, radius, colour, self._line_px)
 
     def _draw_name(self, canvas: Canvas, name: str, track: Track) -> None:
-        size = self._look.font_px
+        size = self._font_px
         at = self.to_px(np.array([[track.x_m, track.y_m]]))[0]
         text = plain_text(name, longest=_LONGEST_NAME)
         width = text_size(text, size)[0]
         x = at[0] + 0.8 * size
         # A name ends inside of the map.
-        if x + width > self._look.size_px[0] - 0.3 * size:
+        if x + width > self._size_px[0] - 0.3 * size:
             x = at[0] - 0.8 * size - width
-        canvas.text((x, at[1] - 0.6 * size), text, size, self._look.colours[name], halo=_FLOOR)
+        canvas.text((x, at[1] - 0.6 * size), text, size, self._scene.colours[name], halo=_FLOOR)
 
 
 def _mix(colour: RGB, share: float) -> RGB:

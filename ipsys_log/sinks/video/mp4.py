@@ -20,8 +20,8 @@ from ipsys_log.messages.channels import MARKERS, TRACKS
 from ipsys_log.sinks.colours import robot_colour
 from ipsys_log.sinks.selection import choose_runs, fade_ns, rig_in_force
 from ipsys_log.sinks.video.canvas import Picture
-from ipsys_log.sinks.video.composite import Composite, Scene
-from ipsys_log.sinks.video.floor_map import MapPart, enlargement
+from ipsys_log.sinks.video.composite import Composite
+from ipsys_log.sinks.video.floor_map import Scene, enlargement
 from ipsys_log.units import NS_PER_S
 
 if TYPE_CHECKING:
@@ -132,14 +132,15 @@ def read_scene(session: Session, run: str, robot: str | None = None) -> tuple[Sc
         known = ", ".join(sorted(robots)) or "none"
         raise IpsysError(f"{session}: tracks has no robot {robot!r} (it has: {known})")
     rig = rig_in_force(session, [run])
-    part = _visible(rig, low, high)
-    radius_m = _RADIUS_SHARE * max(b - a for a, b in zip(part.low_m, part.high_m, strict=True))
+    low, high = _visible(rig, low, high)
+    radius_m = _RADIUS_SHARE * float((high - low).max())
     colours = {name: robot_colour(number) for number, name in enumerate(sorted(robots))}
     scene = Scene(
         tuple(sorted(session.images)),
         {name: colour for name, colour in colours.items() if robot in (None, name)},
         rig,
-        part,
+        low,
+        high,
         enlargement(_covariances(session, tracks), radius_m),
         max(fade_ns(session, tracks).values(), default=NS_PER_S),
         run,
@@ -158,8 +159,8 @@ def _covariances(session: Session, topics: list[str]) -> list[Array]:
     return list(islice(found, _SAMPLE))
 
 
-def _visible(rig: Rig | None, low: Array, high: Array) -> MapPart:
-    """Return the visible part of the floor: the floor of the rig, otherwise the tracks with a margin."""
+def _visible(rig: Rig | None, low: Array, high: Array) -> tuple[Array, Array]:
+    """Return the lowest and highest x and y on the map: those of the rig's floor, else of the tracks."""
     if rig is not None and rig.floor is not None:
         low, high = np.zeros(2), np.array([rig.floor.width_m, rig.floor.depth_m])
     elif not np.isfinite(low).all():
@@ -167,8 +168,7 @@ def _visible(rig: Rig | None, low: Array, high: Array) -> MapPart:
     margin = max(_MARGIN * float((high - low).max()), 0.1)
     least = max(_LEAST_SIDE_M, _LEAST_SHAPE * float((high - low).max()))
     short = np.maximum(least - (high - low), 0.0) / 2
-    low, high = low - margin - short, high + margin + short
-    return MapPart((float(low[0]), float(low[1])), (float(high[0]), float(high[1])))
+    return low - margin - short, high + margin + short
 
 
 def timed_pictures(

@@ -278,7 +278,7 @@ def test_port_in_use_and_foreign_address_are_refused() -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
         with pytest.raises(IpsysError, match=rf"\[nodes\] centre 127.0.0.1:{port}: port {port} is in use"):
-            Centre(cameras(), NodeNetwork("127.0.0.1", port), "0.1.0").__enter__()
+            Centre(cameras(), NodeNetwork("127.0.0.1", port), "0.1.0")
     text = r"\[nodes\] centre 192\.0\.2\.7:7449: is another machine, so nodes and centre need certificates"
     with pytest.raises(IpsysError, match=text):
         read_network(RigNodes("192.0.2.7:7449"), Path())

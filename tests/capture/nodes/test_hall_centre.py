@@ -12,6 +12,7 @@ from threading import Event, Thread
 import pytest
 
 from ipsys_log import __version__
+from ipsys_log.capture.camera_thread import imported_run
 from ipsys_log.capture.devices import source_opener
 from ipsys_log.capture.frames import Clock, Open, Say
 from ipsys_log.capture.lab import first_messages
@@ -114,7 +115,7 @@ def record_hall(folder: Path, lab: GeometricLab, markers: dict[str, list[Markers
         rig = replace(geometric_rig(lab), cameras=tuple(cameras), nodes=RigNodes(str(network)))
         opener = stack.enter_context(source_opener(rig, cameras, folder))
         live = stack.enter_context(AnnouncedCameras(cameras, opener, clock, say, begin))
-        settings = first_messages(rig, dict(lab.calibrations), live.now_ns, live.imported_run)
+        settings = first_messages(rig, dict(lab.calibrations), live.now_ns, imported_run(live.states))
         request = Request(models=(MODEL,), model_from=folder / "calibration.mcap")
         pipeline.live(live, settings, target, request)
     return target

@@ -135,9 +135,9 @@ def describe_streams(streams: Iterable[Stream]) -> list[dict[str, Any]]:
     """Return a row for each stream: its clients if it knows them, and its dropped messages."""
     rows = []
     for stream in streams:
-        counts = {"clients": "client_count", "dropped": "dropped_count"}
-        known = {key: getattr(stream, name, None) for key, name in counts.items()}
-        rows.append({"name": stream.name, **{key: n for key, n in known.items() if n is not None}})
+        clients = getattr(stream, "client_count", None)
+        known = {} if clients is None else {"clients": clients}
+        rows.append({"name": stream.name, **known, "dropped": stream.drops.count})
     return rows
 
 

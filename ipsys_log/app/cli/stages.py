@@ -26,7 +26,7 @@ from ipsys_log.app.report.files import check_folder
 from ipsys_log.errors import IpsysError
 from ipsys_log.extras import check_installed
 from ipsys_log.log.location import LogLocation, parse_location
-from ipsys_log.stages import ENTRIES, parameters_until
+from ipsys_log.stages import ENTRIES, STAGE_NAMES, parameters_until
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -35,8 +35,6 @@ if TYPE_CHECKING:
     from ipsys_log.engine.provenance import Outcome
     from ipsys_log.engine.request import Request
     from ipsys_log.log.dataset import Session
-
-STAGE_NAMES = tuple(entry.name for entry in ENTRIES)
 
 
 def _stage_lines() -> str:

@@ -31,7 +31,7 @@ _HEAVY = {
 _NEEDED = {
     "--help": {"rich.markdown"},  # which the library of the command line imports for any help
     "replay NONE": set(),
-    "info NONE": {"mcap", "numpy", "cv2"},
+    "info NONE": set(),
     "cat LOG --topics /rig": {"mcap", "numpy"},
     "info LOG --sizes": {"mcap", "numpy"},
     "info LOG": {"mcap", "numpy", "cv2"},

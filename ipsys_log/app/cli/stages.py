@@ -73,8 +73,6 @@ _ORDER = (
     *("run", "output", "as_live", "skip_ambiguous", "jobs"),
 )
 
-# The end of a help text.
-MORE = "\n\nThe command runs missing stages first."
 _UNTIL = option(
     str | None, "--until", "STAGE", f"Stop after this stage: {', '.join(STAGE_NAMES)}. Default: fuse."
 )
@@ -94,11 +92,13 @@ Examples
     ipsys replay calibration.mcap --rig lab.toml       # with a corrected rig
     ipsys replay monday.mcap --until detect            # only the markers
 """
-_EVALUATE = f"""
+_EVALUATE = """
 Evaluate models: their errors, the learning curve and outliers of the measurements.
 
 The errors are on held-out calibration points and by cross-validation. Without --model, the command evaluates
-all models; joint only if the log has images or markers.{MORE}
+all models; joint only if the log has images or markers.
+
+The command runs missing stages first.
 
 Examples
 

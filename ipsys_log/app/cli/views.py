@@ -131,7 +131,11 @@ def _report(logs: Sequence[LogLocation], output: Path | None, html: Path | None,
         if evaluated or not has_points:
             page = render_report(session, read_accuracy(session, [one.run for one in evaluated]))
     if has_points and not evaluated:
-        with derive(logs, "evaluate", output, **given) as (session, _, accuracies):
+        with derive(logs, "evaluate", output, again="use ipsys evaluate", **given) as (
+            session,
+            _,
+            accuracies,
+        ):
             page = render_report(session, accuracies)
     write_files(target.parent, {target.name: page.encode()})
     console.print(f"{target} written: open it in a browser")

@@ -64,13 +64,18 @@ class Replay:
             shared = imported_inputs(session)
         first = [stage for stage in self.stages if stage not in of_model]
         self._run_stages(first, shared, None)
-        for model in self.models:
+        several = len(self.models) > 1
+        for done, model in enumerate(self.models):
+            if several:
+                self.progress("models", done, len(self.models))
             try:
                 self._run_stages(of_model, dict(shared), model)
             except FitError as error:
                 if model in self.request.models or model_kind(model).is_checked:
                     raise
                 self.say(f"{model} is left out: {error}")
+        if several:
+            self.progress("models", len(self.models), len(self.models))
 
     def _run_stages(self, stages: Sequence[Stage], inputs: dict[Channel, str], model: str | None) -> None:
         """Run some stages in order, and note the runs of their channels."""
@@ -110,7 +115,7 @@ class Replay:
         """Compute a run. Before the first fit, check that all models can be fitted."""
         progress = self.progress
         if len(self.models) > 1 and is_of_model(task.stage):
-            progress = _name_run(progress, name)
+            progress = name_run(progress, name)
         with one_blas_thread():
             if MODEL in task.stage.writes and task.foreign == () and self.unchecked:
                 check_fits(session, self.request, task.inputs, self.unchecked)
@@ -118,6 +123,6 @@ class Replay:
             yield from compute_messages(task, session, name, progress, self.divided)
 
 
-def _name_run(progress: Progress, run: str) -> Progress:
-    """Return a progress function whose steps name their run: with several models, a stage has several."""
+def name_run(progress: Progress, run: str) -> Progress:
+    """Return a progress function whose steps name their run: with several runs, a stage has several."""
     return lambda stage, done, total: progress(f"{stage} {run}", done, total)

@@ -29,6 +29,7 @@ from ipsys_log.log.location import LogLocation
 from ipsys_log.messages import IMPORTED, MEASUREMENTS_TOPIC, RIG_TOPIC, ChannelRead, Run
 from ipsys_log.messages.channels import EVALUATION, MODEL
 from ipsys_log.messages.stage import Stage
+from ipsys_log.models.table import CORNER_MODELS, MODELS
 
 CURRENT = "current"
 # The record of a model that was fitted to measurements of the same log has one of these parameters.
@@ -79,6 +80,14 @@ def recorded_stages(session: Session) -> list[Recorded]:
             return stages
         stale |= more
         stages = [_judge_inputs(stage, stale) for stage in stages]
+
+
+def newest_evaluations(session: Session) -> list[Recorded]:
+    """Return the newest complete evaluation of each model, in the order of the table of models."""
+    complete = {run.run for run in complete_runs(session) if writes(run, EVALUATION)}
+    stages = [one for one in recorded_stages(session) if writes(one.run, EVALUATION)]
+    newest = {one.method: one for one in stages if one.run.run in complete}
+    return [newest[name] for name in (*MODELS, *CORNER_MODELS) if name in newest]
 
 
 def out_of_date_lines(session: Session, names: Iterable[str | None]) -> list[str]:

@@ -1,15 +1,23 @@
-"""Known contents of logs: a table of contents is parsed once, until another process changes the file."""
+"""Known contents of logs: a table of contents is parsed once, until another process changes the file.
+
+Each command imports this module before it knows whether it will open a log, so the reader of the summary is
+imported later.
+"""
+
+from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 from ipsys_log.log.byte_source import LogBytes, file_identity
-from ipsys_log.log.contents import Contents
 from ipsys_log.log.location import LogUrl
 from ipsys_log.log.remote_bytes import RemoteBytes, RemoteRanges
-from ipsys_log.log.summary import load_contents
+
+if TYPE_CHECKING:
+    from ipsys_log.log.contents import Contents
 
 
 @dataclass(slots=True)
@@ -62,6 +70,8 @@ def contents_of(view: LogBytes) -> Contents:
     LogError
         As :func:`~ipsys_log.log.summary.load_contents`.
     """
+    from ipsys_log.log.summary import load_contents
+
     reading = _reading.get()
     if reading is None or view.is_interrupted:  # with a tail in a journal, the file is not the whole log
         return load_contents(view)

@@ -117,7 +117,7 @@ def _fit_group(cameras: Sequence[CalibrationPoints]) -> list[CameraRays]:
     from scipy.optimize import least_squares
     from scipy.spatial.transform import Rotation
 
-    from ipsys_log.models.closed_form import rigid_transform
+    from ipsys_log.models.plain_models import rigid_transform
 
     starts = [rigid_transform(places.points_m, places.world_m) for places in cameras]
     weights = _weights([name for places in cameras for name in places.point_names])

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ipsys_log.errors import FitError, IpsysError
 from ipsys_log.messages import Array, CameraModel
+from ipsys_log.models.plain_models import Polynomial, Rigid
 from ipsys_log.models.rays import CalibrationPoints, group_cameras
 from ipsys_log.models.uncertainty import Uncertainty, Volume
 
@@ -97,6 +98,9 @@ MODELS = (
     "rayplane",
     "best",
 )
+
+# Models that are applied without scikit-learn, so that live positions begin earlier.
+_PLAIN = {"rigid": Rigid, "poly": Polynomial}
 
 # Models of the corners of markers. The fit estimates all cameras together, see ipsys_log.calibration.joint.
 CORNER_MODELS = ("joint",)
@@ -187,7 +191,7 @@ def predict_array(estimator: Any, points: NDArray[np.float64]) -> NDArray[np.flo
     own ``predict_array`` still does the checks.
     """
     for _, step in _steps(estimator):
-        points = getattr(step, "predict_array", step.predict)(points)
+        points = (step.predict_array if hasattr(step, "predict_array") else step.predict)(points)
     return points
 
 
@@ -229,7 +233,7 @@ def parameters(estimator: Any) -> dict[str, NDArray[np.float64]]:
     >>> model = create("rigid").fit(points, points + 1)
     >>> sorted(parameters(model))
     ['rotation', 'translation']
-    >>> restore("rigid", parameters(model)).predict(points[:1]).round(9).tolist()
+    >>> predict_array(restore("rigid", parameters(model)), points[:1]).round(9).tolist()
     [[1.0, 1.0, 1.0]]
     """
     return {
@@ -240,14 +244,14 @@ def parameters(estimator: Any) -> dict[str, NDArray[np.float64]]:
 
 
 def restore(name: str, arrays: Mapping[str, NDArray[np.float64]]) -> Any:
-    """Return the estimator ``name`` with parameters from :func:`parameters`.
+    """Return the model ``name`` with parameters from :func:`parameters`, for :func:`predict_array`.
 
     Raises
     ------
     IpsysError
         The model is unknown, or a parameter is missing.
     """
-    estimator = create(name)
+    estimator = _PLAIN[name]() if name in _PLAIN else create(name)
     for part, (prefix, step) in zip(name.split("+"), _steps(estimator), strict=True):
         step.n_features_in_ = 4 if MODEL_PARTS[part].reads_height else 3
         for attribute in step.fitted:

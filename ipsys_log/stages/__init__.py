@@ -154,6 +154,7 @@ ENTRIES: tuple[StageEntry, ...] = (
     StageEntry(name="fuse", help="Filter the positions of all cameras into one track per robot."),
     StageEntry(name="smooth", help="Smooth the tracks by the sightings before and after each pose."),
 )
+STAGE_NAMES = tuple(entry.name for entry in ENTRIES)
 
 
 def load_stage(name: str) -> Stage:

@@ -130,7 +130,7 @@ def _growth(predicted_m: Array, fitted: NDArray[np.bool_]) -> tuple[Array, int]:
 
     The redundancy is the number of fitted points minus the number of terms.
     """
-    from ipsys_log.models.closed_form import regressors  # late: scikit-learn takes 1.5 s
+    from ipsys_log.models.plain_models import regressors
 
     centred = predicted_m - predicted_m[fitted].mean(axis=0)
     terms = regressors(centred / np.maximum(np.abs(centred[fitted]).max(axis=0), _LEAST_SPREAD_M))

@@ -10,7 +10,7 @@ import numpy as np
 
 from ipsys_log.errors import FitError
 from ipsys_log.messages import Array, CameraCalibration, CameraModel, Floor, Mask, Model
-from ipsys_log.models.closed_form import rigid_transform
+from ipsys_log.models.plain_models import rigid_transform
 from ipsys_log.statistics.model_kinds import joint_models
 from ipsys_log.vision.lenses import check_calibration, in_image, undistort
 from ipsys_log.vision.poses import PosedCamera

@@ -9,6 +9,7 @@ import numpy as np
 from ipsys_log.engine.execute import compute_messages, one_blas_thread
 from ipsys_log.engine.graph import Task, input_runs, plan_stage, stage_named, writes
 from ipsys_log.engine.provenance import copied_from, is_whole, original_of, replaced_lenses
+from ipsys_log.engine.replay import name_run
 from ipsys_log.engine.request import Progress
 from ipsys_log.engine.states import Recorded, is_fitted_here, recorded_stages
 from ipsys_log.errors import IpsysError
@@ -86,7 +87,8 @@ def verify(
                 f"ipsys info --runs {shell_words(paths[-1])}"
             )
         comparisons = []
-        for name in sorted(names):
+        for number, name in enumerate(sorted(names)):
+            progress("runs", number, len(names))
             records = [record for record in repeated if record.run == name]
             of_others = {
                 output.topic
@@ -102,6 +104,7 @@ def verify(
             )
             own = (row for row in made if row[0].topic not in of_others)
             comparisons += compare_channels(session.stored(sorted(topics)), own)
+        progress("runs", len(names), len(names))
         done = {one.topic for one in comparisons}
         comparisons += _compare_copies(session, names, done, progress, say)
         return sorted([*comparisons, *_unrecorded(session, names - imported)], key=lambda one: one.topic)
@@ -311,5 +314,5 @@ def _made_again(session: Session, run: Run, progress: Progress) -> Iterator[Stor
     inputs = input_runs(run)
     task = plan_stage(stage, session, run.parameters, inputs, run.rig, replaced_lenses(run)) if stage else ""
     if isinstance(task, Task):
-        for message in compute_messages(task, session, run.run, progress):
+        for message in compute_messages(task, session, run.run, name_run(progress, run.run)):
             yield message, encode(message.payload)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import pytest
 
-from ipsys_log.app.cli.console import progress_lines
+from ipsys_log.api import python_api
+from ipsys_log.app.cli import console
+from ipsys_log.app.cli.console import progress_bar, progress_lines
 from tests.conftest import Ipsys
 from tests.publish.packs import SCORED, write_card, write_points_log
 
@@ -29,6 +32,35 @@ def test_long_step_prints_tenths_and_short_one_its_end(capsys: pytest.CaptureFix
     assert capsys.readouterr().err.splitlines() == [*tenths, *ends]
 
 
+def test_each_bar_shows_its_own_progress(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TTY_COMPATIBLE", "1")
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setattr(console, "remarks", console.SafeConsole(sys.stderr, stderr=True))
+    with progress_bar(()) as show:
+        show("models", 0, 3)
+        show("evaluate rigid", 0, 5)
+        show("models", 1, 3)
+    last = capsys.readouterr().err.rpartition("models")[2]
+    assert "1/3" in last.partition("evaluate")[0]
+
+
+def test_whole_work_has_a_bar_beside_those_of_its_steps(tmp_path: Path) -> None:
+    log, steps = write_points_log(tmp_path / "lab.mcap"), []
+    python_api.replay(
+        log, models=["rigid", "poly"], until="evaluate", progress=lambda *step: steps.append(step)
+    )
+    models = [step for step in steps if step[0] == "models"]
+    assert models == [("models", done, 2) for done in range(3)]
+    assert steps[0] == models[0]
+    steps.clear()
+    python_api.verify(log, progress=lambda *step: steps.append(step))
+    assert [step for step in steps if step[0] == "runs"] == [("runs", done, 3) for done in range(4)]
+    assert steps[0][0] == "runs"
+    assert {"evaluate rigid", "evaluate poly"} <= {step[0] for step in steps}
+
+
 @pytest.mark.slow
 def test_pack_prints_its_models_in_a_pipe(tmp_path: Path, ipsys: Ipsys) -> None:
     log, card = write_points_log(tmp_path / "lab.mcap"), write_card(tmp_path / "card.toml")
@@ -36,6 +68,6 @@ def test_pack_prints_its_models_in_a_pipe(tmp_path: Path, ipsys: Ipsys) -> None:
     done = ipsys("pack", log, "-o", tmp_path / "dataset", "--card", card, *models)
     assert done.code == 0, done.err
     lines = [line.partition(":")[0] for line in done.err.splitlines()]
-    assert lines == [f"{stage} {model}" for model in SCORED for stage in ("fit", "evaluate")]
+    assert lines == [*(f"{stage} {model}" for model in SCORED for stage in ("fit", "evaluate")), "models"]
     scored = ipsys("score", tmp_path / "dataset")
     assert "evaluate poly" in {line.partition(":")[0] for line in scored.err.splitlines()}, scored.err

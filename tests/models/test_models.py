@@ -19,7 +19,8 @@ from sklearn.preprocessing import PolynomialFeatures
 from sklearn.utils.estimator_checks import check_estimator
 
 from ipsys_log.errors import FitError, IpsysError
-from ipsys_log.models.closed_form import PolynomialRegression, rigid_transform
+from ipsys_log.models.closed_form import PolynomialRegression
+from ipsys_log.models.plain_models import rigid_transform
 from ipsys_log.models.table import MODELS, create, inputs, min_pairs, parameters, predict_array, restore
 
 
@@ -71,7 +72,7 @@ def test_poly_is_more_exact_than_normal_equations() -> None:
     rng = np.random.default_rng(0)
     points = rng.uniform((-200, -100, 2000), (200, 100, 2000.5), (40, 3))
     coefficients = rng.normal(size=(10, 3))
-    from ipsys_log.models.closed_form import regressors
+    from ipsys_log.models.plain_models import regressors
 
     shifted = (points - points.mean(axis=0)) / 100
     world = regressors(shifted) @ coefficients
@@ -91,7 +92,7 @@ def test_parameters_bring_the_model_back(name: str) -> None:
     arrays = parameters(fitted)
     assert all(array.dtype == np.float64 for array in arrays.values())
     back = restore(name, arrays)
-    np.testing.assert_array_equal(back.predict(points), fitted.predict(points))
+    np.testing.assert_array_equal(predict_array(back, points), fitted.predict(points))
     pickle.loads(pickle.dumps(fitted))  # scikit-learn's tools allow it; the log does not
 
 

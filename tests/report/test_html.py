@@ -15,7 +15,7 @@ from ipsys_log.engine.output import write_log
 from ipsys_log.engine.request import Request
 from ipsys_log.live_runs.pipeline import replay
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import Measurement, Message, ReferencePoint, Suspect
+from ipsys_log.messages import MEASUREMENTS_TOPIC, Measurement, Message, ReferencePoint, Suspect
 from tests import labs
 from tests.conftest import Ipsys
 from tests.report.browser import visit
@@ -130,8 +130,25 @@ def test_report_is_repeatable_and_leaves_the_log_unchanged(ipsys: Ipsys, tmp_pat
     done = ipsys("report", log, "--model", "poly", "--html", tmp_path / "again.html")
     assert done.code == 0
     assert (tmp_path / "again.html").read_bytes() == first
+    # Without options, the evaluation in the log is enough, and no other model is evaluated.
+    done = ipsys("report", log, "--html", tmp_path / "again.html")
+    assert "evaluated before: poly; to add models: ipsys evaluate" in done.err
+    assert (tmp_path / "again.html").read_bytes() == first
     assert log.read_bytes() == held
     assert {path.name for path in tmp_path.iterdir()} == {"lab.mcap", "lab.html", "again.html"}
+
+
+def test_report_evaluates_changed_points_with_the_models_of_the_log(ipsys: Ipsys, tmp_path: Path) -> None:
+    log = tmp_path / "lab.mcap"
+    write_log(log, lab_messages())
+    assert ipsys("evaluate", log, "--model", "poly").code == 0
+    with Session([log]) as session:
+        point = session.payloads([MEASUREMENTS_TOPIC])[-1].id
+    assert ipsys("exclude", log, point, "--reason", "sag").code == 0
+    assert ipsys("report", log).code == 0
+    with Session([log]) as session:
+        assert [run.run for run in session.runs() if run.stage == "evaluate"] == ["poly", "poly_2"]
+    assert "evaluated before: poly;" in ipsys("report", log).err
 
 
 def test_report_into_a_new_log_stands_beside_that_one(ipsys: Ipsys, tmp_path: Path) -> None:

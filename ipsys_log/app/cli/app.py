@@ -5,52 +5,85 @@ from __future__ import annotations
 import copy
 import functools
 import shlex
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
+from importlib import import_module
 from inspect import cleandoc
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
+from typer.main import get_command
 
-from ipsys_log.app.cli import batch
-from ipsys_log.app.cli.calibrate import calibrate
-from ipsys_log.app.cli.calibrate_lab import calibrate_lab
-from ipsys_log.app.cli.camera_poses import align, drift
 from ipsys_log.app.cli.console import remarks, say
-from ipsys_log.app.cli.datasets import catalogue, pack, score
-from ipsys_log.app.cli.imports import KINDS, import_
-from ipsys_log.app.cli.log_copies import cut, merge
-from ipsys_log.app.cli.logs import cat, check, info, repair, verify
-from ipsys_log.app.cli.node import node
-from ipsys_log.app.cli.options import needs_local_files
-from ipsys_log.app.cli.points import exclude, measure, plan
-from ipsys_log.app.cli.record import live, record
-from ipsys_log.app.cli.setup import cameras, init, markers, setup
 from ipsys_log.app.cli.signals import interruptible
-from ipsys_log.app.cli.simulated import drive, simulate
-from ipsys_log.app.cli.stages import STAGE_NAMES, evaluate, replay
-from ipsys_log.app.cli.stream import stream
-from ipsys_log.app.cli.views import export, report, view
+from ipsys_log.stages import STAGE_NAMES
 
-Command = Callable[..., None]
-
-# The commands of the first help screen, in its order.
-_FIRST: dict[str, tuple[Command, ...]] = {
-    "First day, in this order": (
-        *(setup, init, markers, cameras, calibrate, align, record, measure, calibrate_lab, replay, live),
-    ),
-    "Results": (evaluate, plan, report, info, view, export, import_),
+# The commands of the first help screen, in its order, with their purpose as their docstrings state it: the
+# screen imports no command.
+_FIRST: dict[str, dict[str, str]] = {
+    "First day, in this order": {
+        "setup": "Set a lab up on a page, step by step: rig, cameras, intrinsics, points, fit, and the live "
+        "view.",
+        "init": "Write a rig file to edit: markers, cameras, reference points, floor. With comments, or "
+        "from a log.",
+        "markers": "Draw markers and calibration boards as a PDF at true size, with a ruler to check the "
+        "print.",
+        "cameras": "List the USB cameras with device, modes, bus and hub, and check that USB is fast enough "
+        "for all.",
+        "calibrate": "Calibrate camera intrinsics from images of a chessboard or a ChArUco board.",
+        "align": "Show the tilt that makes each camera look straight down, and the floor that all cameras "
+        "see.",
+        "record": "Record the camera frames, unchanged, until Ctrl-C.",
+        "measure": "Enter the tape measurements of a log: on a page for the phone, in the terminal, or from "
+        "a sheet.",
+        "calibrate-lab": "Calibrate all cameras of a lab together, from drives of robots and a few "
+        "measured points.",
+        "replay": "Run the missing stages of a log, append their results to it, and print the accuracy.",
+        "live": "Track robots live: record, and process every frame with all stages up to fuse, until "
+        "Ctrl-C.",
+    },
+    "Results": {
+        "evaluate": "Evaluate models: their errors, the learning curve and outliers of the measurements.",
+        "plan": "Propose the next points to measure, which reduce the predicted error over the floor most.",
+        "report": "Write an HTML page on a session: its accuracy, its recording and its runs.",
+        "info": "Show cameras, channels, counts, rates, gaps and runs of a log.",
+        "view": "Show frames with drawn markers, floor, calibration points, positions and tracks over time, "
+        "in Rerun.",
+        "export": "Export positions, images or another channel to a file for other programs.",
+        "import": "Import recordings, tables or ground truth of other programs into a log.",
+    },
 }
 # Each of these groups has one line there.
-_FURTHER: dict[str, tuple[Command, ...]] = {
-    "Accuracy": (exclude, drift),
-    "Logs": (check, cat, stream, cut, merge, verify, repair),
-    "Datasets": (catalogue, pack, score),
-    "Other hosts": (node,),
-    "Simulated lab": (simulate, drive),
+_FURTHER: dict[str, tuple[str, ...]] = {
+    "Accuracy": ("exclude", "drift"),
+    "Logs": ("check", "cat", "stream", "cut", "merge", "verify", "repair"),
+    "Datasets": ("catalogue", "pack", "score"),
+    "Other hosts": ("node",),
+    "Simulated lab": ("simulate", "drive"),
+    "Many logs": ("batch",),
 }
-_BATCH = "Many logs"
+# The commands by their module; a command imports only its own.
+_MODULES: dict[str, tuple[str, ...]] = {
+    "batch": ("batch",),
+    "calibrate": ("calibrate",),
+    "calibrate_lab": ("calibrate-lab",),
+    "camera_poses": ("align", "drift"),
+    "datasets": ("catalogue", "pack", "score"),
+    "imports": ("import",),
+    "log_copies": ("cut", "merge"),
+    "logs": ("info", "check", "cat", "verify", "repair"),
+    "node": ("node",),
+    "points": ("measure", "plan", "exclude"),
+    "record": ("record", "live"),
+    "setup": ("setup", "init", "markers", "cameras"),
+    "simulated": ("simulate", "drive"),
+    "stages": ("replay", "evaluate"),
+    "stream": ("stream",),
+    "views": ("report", "view", "export"),
+}
+_MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 
 # Old names of commands work for one release; no help shows them.
 _OLD_NAMES: dict[str, tuple[str, ...]] = {
@@ -77,7 +110,7 @@ def present_words(words: list[str]) -> list[str]:
     name, *rest = words
     if name in _OLD_NAMES:
         return [*_OLD_NAMES[name], *rest]
-    if name == "import" and rest and rest[0] in KINDS and _is_kind(*rest):
+    if name == "import" and rest and _is_kind(*rest):
         return ["import", "--as", *rest]
     if name == "measure" and any(word.partition("=")[0] in ("-o", "--output") for word in rest):
         return ["record", "--measure", "--points-only", *rest]
@@ -86,7 +119,9 @@ def present_words(words: list[str]) -> list[str]:
 
 def _is_kind(name: str, *further: str) -> bool:
     """Return whether the first word after ``import`` is a kind, and not a folder of that name."""
-    return not Path(name).exists() or bool(further and not further[0].startswith("-"))
+    from ipsys_log.app.cli.imports import KINDS
+
+    return name in KINDS and (not Path(name).exists() or bool(further and not further[0].startswith("-")))
 
 
 def _settings(words: list[str]) -> list[str]:
@@ -102,8 +137,25 @@ def _settings(words: list[str]) -> list[str]:
     return present
 
 
+class _Commands(Mapping[str, Any]):
+    """The commands by name; asking for a command imports its module."""
+
+    def __getitem__(self, name: str) -> Any:
+        return _load(name, _MODULE_OF[name])
+
+    def __iter__(self) -> Iterator[str]:
+        return chain(*panels().values())
+
+    def __len__(self) -> int:
+        return len(_MODULE_OF)
+
+
 class Commands(TyperGroup):
     """The commands, by their present and their old names; the help lists the first ones."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(**settings)
+        self.commands: Mapping[str, Any] = _Commands()  # type: ignore[assignment]
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Return the name, the command and its words."""
@@ -115,25 +167,44 @@ class Commands(TyperGroup):
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Write the first commands with their purpose; the epilog has the others."""
         first = copy.copy(self)
-        first.commands = {name: self.commands[name] for names in _names(_FIRST).values() for name in names}
+        first.commands = {
+            name: TyperCommand(name, help=purpose, rich_help_panel=group)
+            for group, commands in _FIRST.items()
+            for name, purpose in commands.items()
+        }
         super(Commands, first).format_help(ctx, formatter)
+
+
+@functools.cache
+def _load(name: str, module: str) -> Any:
+    """Return the command of a module, as the parser needs it."""
+    from ipsys_log.app.cli.options import needs_local_files
+
+    def wrapped(command: Callable[..., Any]) -> Callable[..., Any]:
+        return interruptible(needs_local_files(_with_one_reading(command)))
+
+    loaded = import_module(f"ipsys_log.app.cli.{module}")
+    if name == "batch":
+        return get_command(loaded.make_group(wrapped))
+    command = getattr(loaded, "import_" if name == "import" else name.replace("-", "_"))
+    text, _, examples = cleandoc(command.__doc__ or "").partition("\n\nExamples\n\n")
+    single = typer.Typer(add_completion=False)
+    single.command(name, help=_unwrapped(text), epilog=f"Examples\n\n{examples}")(wrapped(command))
+    return get_command(single)
+
+
+def purposes() -> dict[str, str]:
+    """Return the purposes of the commands of the first help screen, by their names."""
+    return {name: purpose for commands in _FIRST.values() for name, purpose in commands.items()}
 
 
 def panels() -> dict[str, tuple[str, ...]]:
     """Return the names of all commands by their groups."""
-    return {**_names(_FIRST), **_names(_FURTHER), _BATCH: ("batch",)}
-
-
-def _names(groups: dict[str, tuple[Command, ...]]) -> dict[str, tuple[str, ...]]:
-    return {group: tuple(map(_name, commands)) for group, commands in groups.items()}
-
-
-def _name(command: Command) -> str:
-    return command.__name__.strip("_").replace("_", "-")
+    return {group: tuple(commands) for group, commands in (_FIRST | _FURTHER).items()}
 
 
 def _epilog() -> str:
-    lines = [f"{group}: {', '.join(panels()[group])}" for group in (*_FURTHER, _BATCH)]
+    lines = [f"{group}: {', '.join(panels()[group])}" for group in _FURTHER]
     return (
         "More commands\n\n"
         + "\n".join(f"    {line}" for line in lines)
@@ -160,10 +231,6 @@ def _with_one_reading(command: Callable[..., Any]) -> Callable[..., Any]:
     return run
 
 
-def _wrapped(command: Callable[..., Any]) -> Callable[..., Any]:
-    return interruptible(needs_local_files(_with_one_reading(command)))
-
-
 app = typer.Typer(
     name="ipsys",
     cls=Commands,
@@ -175,16 +242,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-# The lines of the examples by command, each at most 76 columns.
-EXAMPLES: dict[str, list[str]] = {}
-for group, commands in {**_FIRST, **_FURTHER}.items():
-    for command in commands:
-        text, _, examples = cleandoc(command.__doc__ or "").partition("\n\nExamples\n\n")
-        EXAMPLES[_name(command)] = cleandoc(examples).splitlines()
-        app.command(
-            _name(command), help=_unwrapped(text), epilog=f"Examples\n\n{examples}", rich_help_panel=group
-        )(_wrapped(command))
-batch.add_commands(app, _BATCH, _wrapped)
 
 
 def _print_version(wanted: bool) -> None:

@@ -100,11 +100,11 @@ _EXPORT: dict[str, cli.Option] = {
 }  # fmt: skip
 
 
-def add_commands(
-    app: typer.Typer, panel: str, wrap: Callable[[Callable[..., None]], Callable[..., None]]
-) -> None:
-    """Add the group with its commands, each wrapped: the single commands on many logs."""
+def make_group(wrap: Callable[[Callable[..., None]], Callable[..., None]]) -> typer.Typer:
+    """Return the group with its commands, each wrapped: the single commands on many logs."""
     group = typer.Typer(
+        name="batch",
+        add_completion=False,
         help="Run a command on many logs, with many processes or the workers of a Dask scheduler.",
         no_args_is_help=True,
     )
@@ -130,7 +130,7 @@ def add_commands(
         + _REPEAT
     )
     add("export", text, _export, _EXPORT)
-    app.add_typer(group, name="batch", rich_help_panel=panel)
+    return group
 
 
 def _stage_options(until: str | None) -> dict[str, cli.Option]:

@@ -91,7 +91,6 @@ def calibrate_lab(
     """
     from ipsys_log.engine.graph import writes
     from ipsys_log.engine.request import Request
-    from ipsys_log.live_runs.survey.lab_calibration import describe_lab
     from ipsys_log.messages.channels import MODEL
 
     if not 0 < goal_mm <= _MOST_GOAL_MM:
@@ -123,6 +122,8 @@ def calibrate_lab(
         run = next(outcome.run for outcome in reversed(outcomes) if writes(outcome, MODEL))
         in_force, all_lenses = lab_inputs.lab_of_run(session, run, given_rig, lenses)
         with progress_bar() as progress:
+            from ipsys_log.live_runs.survey.lab_calibration import describe_lab  # after the bar has begun
+
             lab = describe_lab(
                 session, run, in_force, all_lenses, (given_rig, lenses), train, goal_mm / 1000,
                 lambda done, total: progress("describe", done, total),

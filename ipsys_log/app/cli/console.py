@@ -26,7 +26,7 @@ _DRAW_EVERY_S = 0.1
 # A stage with more runs than this gets a count instead of a list.
 _MANY_RUNS = 4
 _LONGEST = 10_000
-# A step with more messages than this prints more than one line in a pipe.
+# A step with more messages than this prints more than one line in a pipe; its bar leaves some out.
 _LONG_STEP = 100
 
 
@@ -126,9 +126,9 @@ def progress_bar(
             elif steps[stage] != step:
                 bar.reset(bars[stage], total=total, description=step, rate="")
             steps[stage] = step
-            # Drawing the bar takes longer than processing a message.
-            now_s = monotonic()
-            if now_s - drawn_s < _DRAW_EVERY_S and done != total:
+            # Drawing the bar takes longer than processing a message; but a short step has few calls.
+            now_s, is_short = monotonic(), total is not None and total <= _LONG_STEP
+            if now_s - drawn_s < _DRAW_EVERY_S and done != total and not is_short:
                 return
             drawn_s = now_s
             speed = bar.tasks[bars[stage]].speed

@@ -21,7 +21,14 @@ from ipsys_log.app.cli.console import (
     say,
     warn,
 )
-from ipsys_log.app.cli.options import appended_log_argument, figure_option, log_argument, setting, switch
+from ipsys_log.app.cli.options import (
+    appended_log_argument,
+    check_present,
+    figure_option,
+    log_argument,
+    setting,
+    switch,
+)
 from ipsys_log.app.cli.signals import writes_nothing
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.location import LogLocation
@@ -71,6 +78,7 @@ def info(
     """
     if plot is not None and not latency:
         raise IpsysError(f"--plot {plot}: has no effect without --latency; add --latency")
+    check_present(logs)
     parts: dict[str, Callable[[], tuple[Any, list[RenderableType]]]] = {}
     if runs:
         parts["runs"] = lambda: _runs(logs)

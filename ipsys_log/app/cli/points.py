@@ -242,7 +242,6 @@ def plan(
     """
     from ipsys_log.engine.graph import writes
     from ipsys_log.engine.request import copied_run
-    from ipsys_log.live_runs.survey.floor_plan import plan_floor
     from ipsys_log.messages.channels import MODEL
     from ipsys_log.messages.rig_file import load_rig
 
@@ -254,6 +253,8 @@ def plan(
         fitted = [outcome.run for outcome in outcomes if writes(outcome, MODEL)]
         run = fitted[-1] if fitted else str(copied_run(session, model))
         in_force, all_lenses = lab_of_run(session, run, given_rig, lenses)
+        from ipsys_log.live_runs.survey.floor_plan import plan_floor  # after the bar of the fit has begun
+
         planned = plan_floor(session, run, in_force, all_lenses, places, height_m or ())
     _show(planned, plot, as_json)
 

@@ -26,7 +26,7 @@ from ipsys_log.app.report.files import check_folder
 from ipsys_log.errors import IpsysError
 from ipsys_log.extras import check_installed
 from ipsys_log.log.location import LogLocation, parse_location
-from ipsys_log.stages import ENTRIES, parameters_until
+from ipsys_log.stages import ENTRIES, STAGE_NAMES, parameters_until
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -35,8 +35,6 @@ if TYPE_CHECKING:
     from ipsys_log.engine.provenance import Outcome
     from ipsys_log.engine.request import Request
     from ipsys_log.log.dataset import Session
-
-STAGE_NAMES = tuple(entry.name for entry in ENTRIES)
 
 
 def _stage_lines() -> str:
@@ -75,8 +73,6 @@ _ORDER = (
     *("run", "output", "as_live", "skip_ambiguous", "jobs"),
 )
 
-# The end of a help text.
-MORE = "\n\nThe command runs missing stages first."
 _UNTIL = option(
     str | None, "--until", "STAGE", f"Stop after this stage: {', '.join(STAGE_NAMES)}. Default: fuse."
 )
@@ -96,11 +92,13 @@ Examples
     ipsys replay calibration.mcap --rig lab.toml       # with a corrected rig
     ipsys replay monday.mcap --until detect            # only the markers
 """
-_EVALUATE = f"""
+_EVALUATE = """
 Evaluate models: their errors, the learning curve and outliers of the measurements.
 
 The errors are on held-out calibration points and by cross-validation. Without --model, the command evaluates
-all models; joint only if the log has images or markers.{MORE}
+all models; joint only if the log has images or markers.
+
+The command runs missing stages first.
 
 Examples
 
@@ -159,12 +157,13 @@ def derive(
     until: str | None,
     output: Path | None = None,
     kept: bool = True,
+    again: str = "repeat the command",
     **given: Any,
 ) -> Iterator[tuple[Session, list[Outcome], list[Accuracy]]]:
     """Run the stages up to ``until``; yield the session with the results, the outcomes, and the accuracy.
 
-    The texts do not name a log that is not ``kept``. ``lenses`` are intrinsics by camera, in addition to the
-    files of ``calibration``.
+    The texts do not name a log that is not ``kept``. ``again`` continues after an interrupt. ``lenses`` are
+    intrinsics by camera, in addition to the files of ``calibration``.
     """
     check_present(logs)
     # Not ``ipsys_log.api.python_api``: its imports take longer than finding that all results are there.
@@ -179,7 +178,7 @@ def derive(
     with one_reading():
         logs, output = choose_target(logs, output)
         request = _request(logs, **given)
-        with say_kept(_kept_runs(logs, output)), progress_bar() as progress:
+        with say_kept(_kept_runs(logs, output, again)), progress_bar() as progress:
             outcomes = pipeline.replay(logs, request, until, output, progress, say, jobs)
         # A new log exists only if there was something to write.
         written = [output] if output is not None and output.exists() else []
@@ -188,7 +187,9 @@ def derive(
     _remark(outcomes, [*logs, *written][-1] if kept else None)
 
 
-def _kept_runs(logs: Sequence[LogLocation], output: Path | None) -> Callable[[Sequence[str]], str]:
+def _kept_runs(
+    logs: Sequence[LogLocation], output: Path | None, again: str
+) -> Callable[[Sequence[str]], str]:
     """Return a function that names the runs that an interrupted command has added."""
     from ipsys_log.engine.provenance import complete_runs
     from ipsys_log.log.dataset import Session
@@ -210,7 +211,7 @@ def _kept_runs(logs: Sequence[LogLocation], output: Path | None) -> Callable[[Se
         named = "; ".join(f"{run} ({', '.join(stages)})" for run, stages in new.items() if stages)
         if not named:
             return f"{logs[-1]} is unchanged: no run was complete"
-        return f"complete in {logs[-1]}: {named}. To continue, repeat the command"
+        return f"complete in {logs[-1]}: {named}. To continue, {again}"
 
     return added
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 from ipsys_log.app.cli.console import console, progress_bar, say
 from ipsys_log.app.cli.options import ReadLogs, setting, switch, with_options
-from ipsys_log.app.cli.stages import MORE, derive, options_until
+from ipsys_log.app.cli.stages import derive, options_until
 from ipsys_log.app.report.files import check_file, write_files
 from ipsys_log.errors import IpsysError
 from ipsys_log.extras import check_installed
@@ -36,15 +36,19 @@ _HTML = (
     ],
     None,
 )
-_REPORT = f"""
+_REPORT = """
 Write an HTML page on a session: its accuracy, its recording and its runs.
 
 The page needs no network. Without calibration points, it has no accuracy. For a log of ipsys drive, it has
-the errors of the robots, and figure 12 of the paper.{MORE}
+the errors of the robots, and figure 12 of the paper.
+
+Without options of stages, the page shows the evaluations in the log; ipsys evaluate adds more. A log that has
+none gets those of all models first.
 
 Examples
 
     ipsys report calibration.mcap                      # calibration.html
+    ipsys report calibration.mcap --model poly --model best
 """
 
 
@@ -101,8 +105,10 @@ def _write_layout(logs: Sequence[LogLocation], runs: Sequence[str], path: Path) 
 
 def _report(logs: Sequence[LogLocation], output: Path | None, html: Path | None, **given: Any) -> None:
     check_installed("report needs", "matplotlib", "jinja2")
+    from ipsys_log.app.report.accuracy import read_accuracy
     from ipsys_log.app.report.html import render_report
     from ipsys_log.app.report.robot_run import render_robot_run
+    from ipsys_log.engine.states import newest_evaluations
     from ipsys_log.log.dataset import Session
     from ipsys_log.messages.channels import MEASUREMENTS
     from ipsys_log.tools.robot_run import has_robot_run
@@ -118,18 +124,31 @@ def _report(logs: Sequence[LogLocation], output: Path | None, html: Path | None,
             console.print(f"{target} and {picture} written")
             return
         has_points = bool(session.topics(MEASUREMENTS))
-        page = "" if has_points else render_report(session, ())
-    if has_points:
-        with derive(logs, "evaluate", output, **given) as (session, _, accuracies):
+        asked = any(given[name] and given[name] != default for name, (_, default) in _DERIVED.items())
+        evaluated = [] if asked else newest_evaluations(session)
+        if any(one.out_of_date for one in evaluated):  # these models again, and no others
+            given["model"], evaluated = [one.method for one in evaluated], []
+        if evaluated or not has_points:
+            page = render_report(session, read_accuracy(session, [one.run for one in evaluated]))
+    if has_points and not evaluated:
+        with derive(logs, "evaluate", output, again="use ipsys evaluate", **given) as (
+            session,
+            _,
+            accuracies,
+        ):
             page = render_report(session, accuracies)
     write_files(target.parent, {target.name: page.encode()})
     console.print(f"{target} written: open it in a browser")
     if not has_points:
         say("the session has no calibration points: the page shows the recording and its runs")
+    elif evaluated:
+        say(f"evaluated before: {', '.join(one.method for one in evaluated)}; to add models: ipsys evaluate")
 
 
 _options = options_until("evaluate")
 del _options["as_json"]
+# The options with which the command computes what they ask for.
+_DERIVED = {name: option for name, option in _options.items() if name not in ("logs", "output", "jobs")}
 report = with_options({**_options, "html": _HTML}, "report", _REPORT)(_report)
 
 

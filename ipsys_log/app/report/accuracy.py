@@ -18,6 +18,7 @@ from ipsys_log.messages import (
     ErrorStatistics,
     Evaluation,
     LearningPoint,
+    Run,
     Suspect,
 )
 from ipsys_log.messages.channels import EVALUATION, MODEL, TRACKS
@@ -110,8 +111,8 @@ class Accuracy:
         return ErrorRow(row.camera, row.against, row.error_3d, row.error_2d, count_repeats(row, rows))
 
 
-def read_accuracy(session: Session, outcomes: Sequence[Outcome]) -> list[Accuracy]:
-    """Read the accuracy of each model from the log that a replay has written."""
+def read_accuracy(session: Session, outcomes: Sequence[Outcome | Run]) -> list[Accuracy]:
+    """Read the accuracy of each model from its log, by the outcomes of a replay or the records of runs."""
     accuracies = []
     for evaluated, fused in _run_pairs(outcomes):
         run = evaluated or fused
@@ -142,7 +143,7 @@ def _track_errors(session: Session, run: str) -> tuple[TrackErrors | None, list[
     return errors, trajectory_errors(paths, true)
 
 
-def _run_pairs(outcomes: Sequence[Outcome]) -> list[tuple[str, str]]:
+def _run_pairs(outcomes: Sequence[Outcome | Run]) -> list[tuple[str, str]]:
     """Return for each model the run of its evaluation and the run of its tracks; "" if there is none.
 
     The two names differ if a model was evaluated again, for example with other folds.

@@ -14,7 +14,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraCalibration, CameraPoints, Measurement, Model, Pair, Rig
 from ipsys_log.messages.channels import CAMERA_POINTS, MODEL
-from ipsys_log.models.closed_form import rigid_transform
+from ipsys_log.models.plain_models import rigid_transform
 from ipsys_log.statistics.alignment import Alignment, align_camera, join_cameras
 from ipsys_log.statistics.calibration_points import find_pairs, measured
 from ipsys_log.statistics.coverage import FloorCoverage, Overlap, cover_floor, find_overlaps

@@ -6,30 +6,32 @@ import re
 from collections import defaultdict
 from dataclasses import asdict, replace
 from statistics import fmean, median
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.text import Text
 
 from ipsys_log.app.report.rows import Rows, mm, name_cell, percent
 from ipsys_log.engine.provenance import channel_times, newest_run
-from ipsys_log.engine.states import recorded_stages
 from ipsys_log.errors import IpsysError
-from ipsys_log.live_runs.survey.from_log import FinishedLog
 from ipsys_log.log.contents import camera_of_topic
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraCalibration, Run
 from ipsys_log.messages.channels import POSITIONS, RUN_EVENTS
 from ipsys_log.messages.events import CONTRADICTIONS
 from ipsys_log.plain_text import plain_text
-from ipsys_log.statistics.calibration_points import active_measurements
 from ipsys_log.statistics.disagreement import read_disagreement, reference_ids
 from ipsys_log.tools.recording import FrameGaps, find_gaps
 from ipsys_log.units import NS_PER_S, format_bytes, format_time
 from ipsys_log.vision.lenses import calibration_remarks, check_calibration
 
+if TYPE_CHECKING:
+    from ipsys_log.live_runs.survey.from_log import FinishedLog
+
 
 def intervals_json(scene: FinishedLog) -> list[dict[str, Any]]:
     """Return the stationary intervals of a log as plain data; ``time_s`` is from the start of the log."""
+    from ipsys_log.statistics.calibration_points import active_measurements
+
     active = active_measurements(scene.history())
     return [
         {
@@ -178,6 +180,8 @@ def _channel(session: Session, topic: str) -> dict[str, Any]:
 
 def states_json(session: Session) -> list[dict[str, Any]]:
     """Return the rows of :func:`runs_json`, each with its state and the version of its stage."""
+    from ipsys_log.engine.states import recorded_stages  # imports all stages
+
     states = [
         {"state": stage.state, "stage_version": stage.stage_version, "out_of_date": stage.out_of_date}
         for stage in recorded_stages(session)

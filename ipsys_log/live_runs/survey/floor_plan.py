@@ -13,7 +13,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Array, CameraCalibration, CameraModel, Model, Rig
 from ipsys_log.messages.channels import MEASUREMENTS, MODEL
-from ipsys_log.models.closed_form import rigid_transform
+from ipsys_log.models.plain_models import rigid_transform
 from ipsys_log.models.table import AppliedModel, reads_corners
 from ipsys_log.models.uncertainty import Uncertainty
 from ipsys_log.statistics.floor_cameras import FloorGrid

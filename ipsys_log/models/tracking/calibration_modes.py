@@ -138,7 +138,7 @@ def _table_nodes(
     name: str, camera: CameraModel, grid: Grid, height_m: float, sigma_m: float | None, in_view: bool
 ) -> NodeModes | None:
     """Return the modes of a model of the table, at the camera points of the nodes; None if it has none."""
-    from ipsys_log.models.closed_form import rigid_transform
+    from ipsys_log.models.plain_models import rigid_transform
 
     applied = AppliedModel(name, camera)
     fitted_m = np.array([pair.camera_m for pair in camera.pairs])

@@ -78,6 +78,18 @@ def _gls(correlations: Array, terms: Array, targets: Array) -> _Gls | None:
     return _Gls(lower, np.asarray(trend, dtype=np.float64), residuals, variance)
 
 
+def _deviances(logs: Array, gaps: Array, terms: Array, targets: Array) -> Array:
+    """Return the deviances (k,) of targets (n, k) with the same correlations; infinite if these fail."""
+    lower, failed = dpotrf(_correlations(logs, gaps)[1], lower=1)
+    if failed:
+        return np.full(targets.shape[1], np.inf)
+    white, _ = dtrtrs(lower, np.hstack([terms, targets]), lower=1)
+    trends, values = np.hsplit(white, [terms.shape[1]])
+    residuals = values - trends @ np.linalg.lstsq(trends, values, rcond=None)[0]
+    variances = np.maximum((residuals**2).mean(axis=0), (10 * _EPS) ** 2)
+    return np.asarray(len(lower) * np.log(variances) + 2 * np.log(np.diagonal(lower)).sum())
+
+
 def _deviance(logs: Array, gaps: Array, terms: Array, targets: Array) -> tuple[float, Array]:
     """Return the deviance and its gradient by the logarithms of theta and the noise."""
     smooth, noisy = _correlations(logs, gaps)
@@ -98,13 +110,13 @@ def fit_correlations(points: Array, targets: Array, noisy: bool) -> Array:
     Parameters
     ----------
     points : (n, d), of unit variance.
-    targets : (n,), of unit variance.
+    targets : (n, k), of unit variance.
     noisy : True if the targets have noise. Its variance is then estimated too.
 
     Returns
     -------
-    Without noise (1,): log theta, the same in all directions. With noise (d + 1,): log theta by axis, and the
-    logarithm of the noise relative to the variance of the process.
+    Without noise (k, 1): log theta, the same in all directions. With noise (k, d + 1): log theta by axis, and
+    the logarithm of the noise relative to the variance of the process.
 
     References
     ----------
@@ -115,16 +127,15 @@ def fit_correlations(points: Array, targets: Array, noisy: bool) -> Array:
     bounds = [_THETA[noisy]] * len(gaps) + [_NOISE] * noisy
     low, high = np.array(bounds).T
     starts = low + (high - low) * Sobol(len(bounds), scramble=False).random_base2(_STARTS_LOG2)
-    costs = []
-    for start in starts:
-        fitted = _gls(_correlations(start, gaps)[1], terms, targets)
-        costs.append(np.inf if fitted is None else fitted.deviance())
-    optima = [
-        minimize(_deviance, starts[i], (gaps, terms, targets), jac=True, bounds=bounds, method="L-BFGS-B")
-        for i in np.argsort(costs, kind="stable")[:_REFINED]
-    ]
-    best: Array = min(optima, key=lambda result: float(result.fun)).x
-    return best
+    costs = np.array([_deviances(start, gaps, terms, targets) for start in starts])
+    best = []
+    for own, column in zip(costs.T, targets.T, strict=True):
+        optima = [
+            minimize(_deviance, starts[i], (gaps, terms, column), jac=True, bounds=bounds, method="L-BFGS-B")
+            for i in np.argsort(own, kind="stable")[:_REFINED]
+        ]
+        best.append(min(optima, key=lambda result: float(result.fun)).x)
+    return np.array(best)
 
 
 class Kriging(MultiOutputMixin, RegressorMixin, BaseEstimator):  # type: ignore[misc]
@@ -180,7 +191,7 @@ class Kriging(MultiOutputMixin, RegressorMixin, BaseEstimator):  # type: ignore[
         self.target_centre_, self.target_scale_ = targets.mean(axis=0), column_sigmas(targets)
         self.points_ = (X - self.centre_) / self.scale_
         scaled = (targets - self.target_centre_) / self.target_scale_
-        self.logs_ = np.array([fit_correlations(self.points_, column, self.noisy) for column in scaled.T])
+        self.logs_ = fit_correlations(self.points_, scaled, self.noisy)
         solved = [self._solve(logs, column) for logs, column in zip(self.logs_, scaled.T, strict=True)]
         self.trend_ = np.array([gls.trend for gls in solved])
         self.weights_ = np.array(

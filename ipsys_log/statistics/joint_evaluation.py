@@ -1,13 +1,14 @@
 """The joint calibration of a log: its fit, and its errors on points that are not in the fit."""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from ipsys_log.calibration.joint.diagnosis import find_faults, point_covariances
-from ipsys_log.calibration.joint.fit import JointFit
+from ipsys_log.calibration.joint.fit import JointFit, refit_without
 from ipsys_log.calibration.joint.from_messages import gather_observations
 from ipsys_log.calibration.joint.hypotheses import fit_hypotheses
 from ipsys_log.calibration.joint.locate import locate_markers
@@ -177,35 +178,60 @@ def evaluate_joint(
         rows = _held_out_rows(model, cameras, observations, study, used)
         return Evaluation(time_ns, model.name, tuple(rows))
     gross = {suspect.measurement for suspect in excluded}
+    try:
+        fits = whole = _Fits(observations, frozenset())
+    except FitError as error:
+        notes.append(f"no cross-validation, and no search for outliers: {error}")
+        rows = _held_out_rows(model, cameras, observations, study, used)
+        return Evaluation(time_ns, model.name, tuple(rows))
     clean, reduced = study, cameras
     if gross:
         try:
-            reduced = _refit_without(gross, observations, used)
+            fits = _Fits(observations, frozenset(gross))
+            reduced = build_models(fits.without({point.name for point in observations.points} - used))
             clean = _without(study, gross)
         except FitError as error:
             notes.append(f"gross outliers are not excluded: {error}")
-            excluded, gross = (), set()
+            fits, excluded, gross = whole, (), set()
     points = gather_points(clean.pairs)
     sizes = learning_sizes(model.name, points) if points else []
     steps = _Steps(FOLDS * (1 + bool(gross)) + len(sizes) + 1, progress)
     rows = _held_out_rows(model, reduced, observations, clean, used)
-    rows += _cross_validated_rows(model, observations, clean, gross, notes, steps)
-    learning = _learning(model.name, observations, clean, gross, steps)
+    rows += _cross_validated_rows(model, fits, clean, notes, steps)
+    learning = _learning(model.name, fits, clean, steps)
     with_excluded: list[CameraEvaluation] = []
     if gross:
         with_excluded = _held_out_rows(model, cameras, observations, study, used)
-        with_excluded += _cross_validated_rows(model, observations, study, set(), [], steps)
-    suspects = _suspects(observations, study, notes)
+        with_excluded += _cross_validated_rows(model, whole, study, [], steps)
+    suspects = _find_joint_outliers(whole.fit, study.places)
     steps.done()
     return Evaluation(
         time_ns, model.name, tuple(rows), tuple(learning), suspects, excluded, tuple(with_excluded)
     )
 
 
-def _refit_without(names: set[str], observations: Observations, used: Collection[str]) -> Models:
-    """Return the models of a fit to the points ``used``, without some of them."""
-    unused = {point.name for point in observations.points} - set(used)
-    return build_models(fit_without(observations, unused | names))
+class _Fits:
+    """A fit, and the fits without further calibration points, which start at it.
+
+    Raises
+    ------
+    FitError
+        The observations do not determine the cameras.
+    """
+
+    def __init__(self, observations: Observations, left_out: frozenset[str]) -> None:
+        self.observations, self._left_out = observations, left_out
+        self.fit = fit_without(observations, left_out)
+
+    def without(self, names: Collection[str]) -> JointFit:
+        """Return the fit without further points.
+
+        A correction of the readings of a point is only right for the fit that found it.
+        """
+        if not self.fit.known and self.fit.is_certain:
+            with suppress(FitError):  # of a camera that sees no other point
+                return refit_without(self.fit, names)
+        return fit_without(self.observations, self._left_out.union(names))
 
 
 class _Steps:
@@ -244,19 +270,14 @@ def _held_out_rows(
 
 
 def _cross_validated_rows(
-    model: Model,
-    observations: Observations,
-    study: Study,
-    left_out: set[str],
-    notes: list[str],
-    steps: _Steps,
+    model: Model, fits: _Fits, study: Study, notes: list[str], steps: _Steps
 ) -> list[CameraEvaluation]:
     assert study.seed is not None
     parts = []
     try:
         for fold in make_folds(gather_points(study.pairs), FOLDS, np.random.default_rng(study.seed)):
-            fitted = build_models(fit_without(observations, fold | left_out))
-            parts.append(_predict(fitted, observations, study, fold))
+            fitted = build_models(fits.without(fold))
+            parts.append(_predict(fitted, fits.observations, study, fold))
             steps.done()
     except FitError as error:
         notes.append(f"no cross-validation: {error}")
@@ -264,9 +285,7 @@ def _cross_validated_rows(
     return _error_rows(model, parts, study, CROSS_VALIDATION)
 
 
-def _learning(
-    name: str, observations: Observations, study: Study, excluded: set[str], steps: _Steps
-) -> list[LearningPoint]:
+def _learning(name: str, fits: _Fits, study: Study, steps: _Steps) -> list[LearningPoint]:
     """Return the errors by the number of calibration points, each with all drives."""
     assert study.seed is not None
     cameras = gather_points(study.pairs)
@@ -274,12 +293,12 @@ def _learning(
         return []
 
     def predict(left_out: Collection[str]) -> dict[str, Array]:
-        models = build_models(fit_without(observations, {*left_out, *excluded}))
+        models = build_models(fits.without(left_out))
         # A camera without a sighting has no model: then this subset counts for no camera.
         if missing := cameras.keys() - models.keys():
             raise FitError(f"camera {min(missing)}: it saw no point of the subset")
         everything = {name for places in cameras.values() for name in places.names}
-        predicted = _predict(models, observations, study, everything)
+        predicted = _predict(models, fits.observations, study, everything)
         return {camera: points_m for camera, (_, points_m, _) in predicted.items()}
 
     points = published_curve(name, cameras, study.subsets, study.held_out, predict)
@@ -287,15 +306,6 @@ def _learning(
         points += more
         steps.done()
     return points
-
-
-def _suspects(observations: Observations, study: Study, notes: list[str]) -> tuple[Suspect, ...]:
-    """Return the measurements that contradict a fit to all points."""
-    try:
-        return _find_joint_outliers(fit_without(observations, ()), study.places)
-    except FitError as error:
-        notes.append(f"no search for outliers: {error}")
-        return ()
 
 
 # Pairs of a camera, with their predictions (n, 3) and covariances (n, 3, 3).

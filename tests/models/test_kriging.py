@@ -85,7 +85,7 @@ def test_fitted_parameters_maximise_the_likelihood() -> None:
         sigma2 = (z - f @ alpha) @ inverse @ (z - f @ alpha) / len(z)
         return float(multivariate_normal.logpdf(z, f @ alpha, sigma2 * full))
 
-    best = fit_correlations(points, z, noisy=True)
+    (best,) = fit_correlations(points, z[:, None], noisy=True)
     rng = np.random.default_rng(0)
     low, high = np.log([1e-3, 1e-3, 1e-3, 1e-8]), np.log([1.0, 1.0, 1.0, 1e2])
     others = [*(best + rng.normal(0, 0.1, 4) for _ in range(40)), *rng.uniform(low, high, (200, 4))]

@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ipsys_log.calibration.joint.floor_field import FloorField, make_floor_field
-from ipsys_log.calibration.joint.observations import Observations
+from ipsys_log.calibration.joint.observations import Observations, without_points
 from ipsys_log.calibration.joint.parameters import Layout, State, make_layout
 from ipsys_log.calibration.joint.path_start import start_paths
 from ipsys_log.calibration.joint.point_factors import make_point_factors
 from ipsys_log.calibration.joint.prior_sigmas import most_likely_scale, widen_tape
 from ipsys_log.calibration.joint.problem import Problem, find_blocks
 from ipsys_log.calibration.joint.settings import JointSettings
-from ipsys_log.calibration.joint.sighting_factors import make_sighting_factors
+from ipsys_log.calibration.joint.sighting_factors import SightingFactors, make_sighting_factors
 from ipsys_log.calibration.joint.solver import SHORT, ConvergenceError, Solution, solve
 from ipsys_log.calibration.joint.start import PlacedCamera, UnplacedError, place_cameras, rough_points
 from ipsys_log.calibration.joint.trajectories import Kind, Trajectories
 from ipsys_log.errors import FitError
-from ipsys_log.messages import Array
+from ipsys_log.messages import Array, Indices
 from ipsys_log.vision.poses import level_turns
 
 # The field of the floor reaches this far beyond the outermost place of a marker.
@@ -138,6 +138,40 @@ def fit_shape(
     settings = replace(settings, floor_sigma_spread=0.0)
     held = max(range(len(placed)), key=lambda camera: len(observations.sightings[camera]))
     return _fit(untaped, settings, placed, progress, held)
+
+
+def refit_without(
+    fit: JointFit, left_out: Collection[str], progress: Callable[[int, float], None] = lambda step, cost: None
+) -> JointFit:
+    """Estimate a lab without some of the calibration points of a fit, in a few steps from this fit.
+
+    The unevenness of the floor, the wobble of the robots and the standard deviation of the tape's scale stay
+    those of the fit.
+
+    Raises
+    ------
+    FitError
+        The other observations do not determine the cameras.
+    """
+    observations = without_points(fit.observations, left_out)
+    check_observations(observations)
+    kept = [n for n, point in enumerate(fit.observations.points) if point.name not in left_out]
+    stationary = [sightings.point for sightings in observations.sightings]
+    factors = _make_factors(observations, fit.settings, Kind.STATIONARY, stationary)
+    factors += [one for one in fit.problem.sightings if one.kind is not Kind.STATIONARY]
+    layout, trajectories = fit.problem.layout, replace(fit.problem.trajectories, stationary=len(kept))
+    problem = Problem(
+        layout,
+        trajectories,
+        tuple(sorted(factors, key=lambda one: one.camera)),
+        make_point_factors(observations.points, observations.tape, fit.settings.point_tilt_sigma_rad),
+        find_blocks(layout, trajectories, factors) if observations.in_hall else (),
+    )
+    state = replace(fit.state, positions_m=fit.state.positions_m[kept], turns=fit.state.turns[kept])
+    try:
+        return _solve(observations, fit.settings, problem, state, progress, _NEAR)
+    except ConvergenceError as error:
+        raise explain_divergence(error, observations) from error
 
 
 def check_observations(observations: Observations) -> None:
@@ -265,20 +299,10 @@ def _build(
     """Return the problem and its start."""
     paths, knots, numbers = start_paths(observations, placed, settings)
     layout = make_layout(observations, settings, _floor(placed, settings), len(paths) > 0)
-    factors = []
-    for camera, (sightings, path) in enumerate(zip(observations.sightings, numbers, strict=True)):
-        for kind, trajectory in ((Kind.STATIONARY, sightings.point), (Kind.FLOOR, path)):
-            rows = trajectory >= 0
-            if rows.any():
-                own = sightings.select(rows), trajectory[rows], kind
-                # Only an average over many frames has less noise than the errors of print and lens.
-                floor_px = settings.corner_floor_px if kind is Kind.STATIONARY else 0.0
-                made = make_sighting_factors(camera, *own, observations.bodies, floor_px)
-                if observations.cameras[camera].known_row_s:
-                    # With a row time, whether right or wrong, detection gives the corners of one instant.
-                    rows_px = made.rows.mean(axis=1, keepdims=True)
-                    made = replace(made, rows=np.broadcast_to(rows_px, made.rows.shape))
-                factors.append(made)
+    stationary = [sightings.point for sightings in observations.sightings]
+    factors = _make_factors(observations, settings, Kind.STATIONARY, stationary)
+    factors += _make_factors(observations, settings, Kind.FLOOR, numbers)
+    factors.sort(key=lambda one: one.camera)
     if lost := sorted(set(range(len(placed))) - {own.camera for own in factors}):
         raise UnplacedError(observations, lost)
     trajectories = Trajectories(
@@ -294,6 +318,27 @@ def _build(
     state = State(values, turns, positions_m, level_turns(headings_rad), knots)
     blocks = find_blocks(layout, trajectories, factors) if observations.in_hall else ()
     return Problem(layout, trajectories, tuple(factors), points, blocks), state
+
+
+def _make_factors(
+    observations: Observations, settings: JointSettings, kind: Kind, trajectories: list[Indices]
+) -> list[SightingFactors]:
+    """Return the factors of one kind; ``trajectories`` has that of each sighting of each camera, or -1."""
+    factors = []
+    # Only an average over many frames has less noise than the errors of print and lens.
+    floor_px = settings.corner_floor_px if kind is Kind.STATIONARY else 0.0
+    for camera, (sightings, trajectory) in enumerate(zip(observations.sightings, trajectories, strict=True)):
+        rows = trajectory >= 0
+        if not rows.any():
+            continue
+        own = sightings.select(rows), trajectory[rows], kind
+        made = make_sighting_factors(camera, *own, observations.bodies, floor_px)
+        if observations.cameras[camera].known_row_s:
+            # With a row time, whether right or wrong, detection gives the corners of one instant.
+            rows_px = made.rows.mean(axis=1, keepdims=True)
+            made = replace(made, rows=np.broadcast_to(rows_px, made.rows.shape))
+        factors.append(made)
+    return factors
 
 
 def _floor(placed: list[PlacedCamera], settings: JointSettings) -> FloorField:

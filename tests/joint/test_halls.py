@@ -205,7 +205,8 @@ def test_blocks_give_the_same_motions_of_cameras(
     started: tuple[GeometricLab, Observations, Problem, State], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """An honest hall has no evidence of a motion; the motions with most of it are compared."""
-    monkeypatch.setattr("ipsys_log.calibration.joint.moved_cameras._CONTRADICTED", 1.0)
+    for limit in ("_CONTRADICTED", "_CONTRADICTED_BY_FEW"):
+        monkeypatch.setattr(f"ipsys_log.calibration.joint.moved_cameras.{limit}", 1.0)
     _, observations, problem, state = started
     motions = []
     for one in (problem, problem_without_blocks(problem)):

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
@@ -81,6 +83,19 @@ class PieceRun:
         pieces = load_stage(self.stage).pieces
         assert pieces is not None, f"{self.stage} has no pieces"
         return pieces(self.parameters)
+
+    @contextmanager
+    def open(self) -> Iterator[Callable[[Piece], PieceResult]]:
+        """Open the logs; yield the function that computes a piece.
+
+        Raises
+        ------
+        IpsysError
+            A log has changed.
+        """
+        with Session(self.paths) as session:
+            check_versions(session, self)
+            yield partial(compute_piece, session, self)
 
 
 class Piece(NamedTuple):

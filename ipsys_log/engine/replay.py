@@ -8,9 +8,11 @@ from ipsys_log.engine.checks import check_earlier_runs, describe_changed_images
 from ipsys_log.engine.execute import compute_messages, one_blas_thread, run_stage
 from ipsys_log.engine.graph import Task, copy_model, is_of_model, plan_stage
 from ipsys_log.engine.model_checks import check_fits
+from ipsys_log.engine.model_runs import ModelRuns
 from ipsys_log.engine.pieces import DividedRun, PieceWorkers, divide_run
 from ipsys_log.engine.provenance import Outcome, imported_inputs
 from ipsys_log.engine.request import Progress, Request
+from ipsys_log.engine.workers import LocalWorkers
 from ipsys_log.errors import FitError
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.location import LogLocation
@@ -29,7 +31,7 @@ class Replay:
     request : the options of the stages.
     stages, models : those to compute, in order.
     logs, target : the logs to read as one, and the log that gets the results.
-    workers : they compute the pieces of a long log.
+    workers, local : they compute the pieces of a long log, and the evaluations of several models.
     progress, say : called with the state of the work, and with remarks.
     unchecked : several models of which it is not known yet if all can be fitted.
     outcomes : one for each stage so far.
@@ -42,6 +44,7 @@ class Replay:
     logs: Sequence[LogLocation]
     target: Path
     workers: PieceWorkers
+    local: LocalWorkers
     progress: Progress
     say: Callable[[str], None]
     unchecked: list[str] = field(init=False)
@@ -59,31 +62,51 @@ class Replay:
         IpsysError
             The input has a fault that the user must correct.
         """
-        of_model = [stage for stage in self.stages if is_of_model(stage)]
         with Session(self.logs) as session:
             shared = imported_inputs(session)
-        first = [stage for stage in self.stages if stage not in of_model]
-        self._run_stages(first, shared, None)
-        several = len(self.models) > 1
-        for done, model in enumerate(self.models):
+        of_model = [stage for stage in self.stages if is_of_model(stage)]
+        self._run_stages([stage for stage in self.stages if stage not in of_model], shared)
+        inputs = {model: dict(shared) for model in self.models}
+        # All fits come first: the evaluations then need nothing from one another.
+        fits = [stage for stage in of_model if stage.of_model]
+        self._run_models(fits, inputs)
+        self._run_models([stage for stage in of_model if stage not in fits], inputs)
+
+    def _run_models(self, stages: Sequence[Stage], inputs: dict[str, dict[Channel, str]]) -> None:
+        """Run some stages for each model in order; a model that cannot be fitted leaves ``inputs``."""
+        if not stages:
+            return
+        names, several = [*inputs], len(self.models) > 1
+        runs = ModelRuns(self.logs, self.request, stages, inputs, self.local)
+        step = "fits" if stages[0].of_model else "models"
+        for place, model in enumerate(names):
             if several:
-                self.progress("models", done, len(self.models))
+                self.progress(step, place, len(names))
             try:
-                self._run_stages(of_model, dict(shared), model)
+                self._run_stages(stages, inputs[model], model, runs)
             except FitError as error:
                 if model in self.request.models or model_kind(model).is_checked:
                     raise
                 self.say(f"{model} is left out: {error}")
+                del inputs[model]
         if several:
-            self.progress("models", len(self.models), len(self.models))
+            self.progress(step, len(names), len(names))
 
-    def _run_stages(self, stages: Sequence[Stage], inputs: dict[Channel, str], model: str | None) -> None:
+    def _run_stages(
+        self,
+        stages: Sequence[Stage],
+        inputs: dict[Channel, str],
+        model: str | None = None,
+        runs: ModelRuns | None = None,
+    ) -> None:
         """Run some stages in order, and note the runs of their channels."""
         for stage in stages:
-            run = self._run_stage(stage, inputs, model)
+            run = self._run_stage(stage, inputs, model, runs)
             inputs.update({channel: run for channel in stage.writes if channel is not RUN_EVENTS})
 
-    def _run_stage(self, stage: Stage, inputs: Mapping[Channel, str], model: str | None) -> str:
+    def _run_stage(
+        self, stage: Stage, inputs: Mapping[Channel, str], model: str | None, runs: ModelRuns | None
+    ) -> str:
         """Run a stage, or find its result; return its run."""
         request = self.request
         with Session(self.logs) as session:
@@ -95,6 +118,8 @@ class Replay:
                 task = plan_stage(stage, session, options, inputs, request.rig, request.lenses)
             if isinstance(task, str):
                 return task
+            if runs is not None:
+                task = runs.task_of(str(model), task)
             until, target = self.stages[-1], self.target
             outcome = run_stage(
                 session, target, task, request, until, self._messages, self.say, self._prepare

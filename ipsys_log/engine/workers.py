@@ -1,4 +1,4 @@
-"""Worker processes of this machine, which compute the pieces of a run.
+"""Worker processes of this machine, which compute the pieces of a work, such as a run.
 
 Each worker gets the numbers of its pieces through its pipe, and sends their results back. A worker ends with
 its pipe, so that none remains after this process. The pieces of a worker that was killed go to another one.
@@ -10,13 +10,12 @@ import os
 import pickle
 import traceback
 from collections import Counter, deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from multiprocessing.connection import Connection, wait
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
-from ipsys_log.engine.pieces import Piece, PiecePlan, PieceResult, PieceRun
 from ipsys_log.engine.piped_process import PipedProcess, parent_pipe
 from ipsys_log.errors import IpsysError
 
@@ -50,6 +49,28 @@ def check_jobs(jobs: int) -> None:
         )
 
 
+class Work(Protocol):
+    """The part of a work that all its pieces have in common. It can be pickled."""
+
+    def open(self) -> AbstractContextManager[Callable[[Any], Any]]:
+        """Open the inputs; the context manager gives the function from a piece to its result."""
+        ...
+
+
+class Plan(Protocol):
+    """The division of a work into pieces."""
+
+    @property
+    def run(self) -> Work: ...
+
+    @property
+    def pieces(self) -> Sequence[Any]: ...
+
+    def ahead(self, workers: int, /) -> int:
+        """Return how many pieces may be in work or finished before the pieces in front of them are used."""
+        ...
+
+
 class _Failure(NamedTuple):
     """An error in a worker, with its traceback."""
 
@@ -69,10 +90,10 @@ class _Worker(PipedProcess):
         with suppress(OSError):  # if it has ended, receive() tells so
             self.sender.send(message)
 
-    def receive(self) -> PieceResult | None:
+    def receive(self) -> Any:
         """Return the result of its first piece; None if the process has ended."""
         try:
-            answer: PieceResult | _Failure = self.receiver.recv()
+            answer: Any = self.receiver.recv()
         except (EOFError, OSError):
             return None
         if isinstance(answer, _Failure):
@@ -106,7 +127,7 @@ class LocalWorkers:
         """True if there is more than one process."""
         return self.jobs > 1
 
-    def prepare(self, plan: PiecePlan) -> None:
+    def prepare(self, plan: Plan) -> None:
         """Start the workers of a plan; they import the package while this process prepares the run.
 
         Raises
@@ -124,7 +145,7 @@ class LocalWorkers:
                     f"({error.strerror}); give fewer processes with --jobs"
                 ) from error
 
-    def compute(self, plan: PiecePlan) -> Iterator[PieceResult]:
+    def compute(self, plan: Plan) -> Iterator[Any]:
         """Yield the results of the pieces in their order; the workers may finish them in another order.
 
         Raises
@@ -135,7 +156,7 @@ class LocalWorkers:
             An error in a worker, with a note of its traceback.
         """
         ended: Counter[int] = Counter()
-        finished: dict[int, PieceResult] = {}
+        finished: dict[int, Any] = {}
         waiting = deque(range(len(plan.pieces)))
         try:
             self.prepare(plan)
@@ -172,7 +193,7 @@ class LocalWorkers:
         ready: Sequence[Any] = wait([worker.receiver for worker in self._workers])
         return [worker for worker in self._workers if worker.receiver in ready]
 
-    def _replace(self, worker: _Worker, plan: PiecePlan, waiting: deque[int], ended: Counter[int]) -> None:
+    def _replace(self, worker: _Worker, plan: Plan, waiting: deque[int], ended: Counter[int]) -> None:
         """Start another worker instead of one that has ended, and let its pieces wait again.
 
         Raises
@@ -210,20 +231,16 @@ def serve() -> None:
         os._exit(0)  # the process that waits for results has ended
 
 
-def _serve(run: PieceRun, pieces: Sequence[Piece], receiver: Connection, sender: Connection) -> None:
+def _serve(run: Work, pieces: Sequence[Any], receiver: Connection, sender: Connection) -> None:
     import cv2
-
-    from ipsys_log.engine.pieces import check_versions, compute_piece
-    from ipsys_log.log.dataset import Session
 
     cv2.setNumThreads(1)
     sent: Future[None] | None = None
     try:
         # The next piece is computed while the other process has no time to read a result.
-        with Session(run.paths) as session, ThreadPoolExecutor(1) as thread:
-            check_versions(session, run)
+        with run.open() as compute, ThreadPoolExecutor(1) as thread:
             while True:
-                result = compute_piece(session, run, pieces[receiver.recv()])
+                result = compute(pieces[receiver.recv()])
                 if sent is not None:
                     sent.result()
                 sent = thread.submit(_send, sender, result)
@@ -233,7 +250,7 @@ def _serve(run: PieceRun, pieces: Sequence[Piece], receiver: Connection, sender:
         sender.send(_failure(error))
 
 
-def _send(sender: Connection, result: PieceResult) -> None:
+def _send(sender: Connection, result: object) -> None:
     """Send a result, or the error that prevents it: the other process waits for one of them."""
     try:
         sender.send(result)

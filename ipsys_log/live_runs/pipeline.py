@@ -83,7 +83,8 @@ def replay(
     paths : the logs, read as one; results go to the last of them, or to ``output``.
     until : the last stage; None: all stages. With fuse, models are also evaluated if points are held out.
     say : called before the computation, with the runs that are out of date and the reason.
-    jobs : number of processes that detect markers in a long log; the bytes are the same with any number.
+    jobs : number of processes that detect markers in a long log, or evaluate several models; the bytes are
+        the same with any number.
     workers : they compute the pieces of a long log, instead of ``jobs`` processes of this machine.
 
     Returns
@@ -105,7 +106,7 @@ def replay(
     if workers is not None and workers.first_only and len(stages) > 1:
         request, stages = replace(request, run=None), stages[:1]  # the given name is for the last stage
     with open_target(paths, output) as (logs, target), LocalWorkers(jobs) as local:
-        work = Replay(request, stages, models, logs, target, workers or local, progress, say)
+        work = Replay(request, stages, models, logs, target, workers or local, local, progress, say)
         work.compute()
     return work.outcomes
 

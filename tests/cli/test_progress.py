@@ -47,13 +47,14 @@ def test_each_bar_shows_its_own_progress(
 
 
 def test_whole_work_has_a_bar_beside_those_of_its_steps(tmp_path: Path) -> None:
-    log, steps = write_points_log(tmp_path / "lab.mcap"), []
+    log = write_points_log(tmp_path / "lab.mcap")
+    steps: list[tuple[str, int, int | None]] = []
     python_api.replay(
         log, models=["rigid", "poly"], until="evaluate", progress=lambda *step: steps.append(step)
     )
-    models = [step for step in steps if step[0] == "models"]
-    assert models == [("models", done, 2) for done in range(3)]
-    assert steps[0] == models[0]
+    for whole in ("fits", "models"):
+        assert [step for step in steps if step[0] == whole] == [(whole, done, 2) for done in range(3)]
+    assert steps[:1] == [("fits", 0, 2)]
     steps.clear()
     python_api.verify(log, progress=lambda *step: steps.append(step))
     assert [step for step in steps if step[0] == "runs"] == [("runs", done, 3) for done in range(4)]
@@ -68,6 +69,7 @@ def test_pack_prints_its_models_in_a_pipe(tmp_path: Path, ipsys: Ipsys) -> None:
     done = ipsys("pack", log, "-o", tmp_path / "dataset", "--card", card, *models)
     assert done.code == 0, done.err
     lines = [line.partition(":")[0] for line in done.err.splitlines()]
-    assert lines == [*(f"{stage} {model}" for model in SCORED for stage in ("fit", "evaluate")), "models"]
+    fits, evaluations = ([f"{stage} {model}" for model in SCORED] for stage in ("fit", "evaluate"))
+    assert lines == [*fits, "fits", *evaluations, "models"]
     scored = ipsys("score", tmp_path / "dataset")
     assert "evaluate poly" in {line.partition(":")[0] for line in scored.err.splitlines()}, scored.err

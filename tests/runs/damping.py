@@ -66,6 +66,7 @@ def _add_stage() -> None:
     """Add the stage to the tables of the program before it reads them, as its file would."""
     sys.modules[f"ipsys_log.stages.{ENTRY.module}"] = sys.modules[__name__]
     stages.ENTRIES = (*stages.ENTRIES, ENTRY)
+    stages.STAGE_NAMES = (*stages.STAGE_NAMES, ENTRY.name)
     channels.CHANNELS = (*channels.CHANNELS, DAMPED_TRACKS)
 
 

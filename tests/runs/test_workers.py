@@ -20,12 +20,15 @@ from ipsys_log.engine.request import Request
 from ipsys_log.engine.workers import LocalWorkers
 from ipsys_log.errors import IpsysError
 from ipsys_log.live_runs.pipeline import replay
+from ipsys_log.log.dataset import Session
 from ipsys_log.log.reader import LogReader
 from tests.conftest import Ipsys
+from tests.publish.packs import write_points_log
 
 pytestmark = pytest.mark.slow  # each process imports the package
 
 REQUEST = Request(parameters={"reset_s": "2"})
+MODELS = Request(models=("rigid", "poly", "rigid+poly", "kriging"))
 # A worker that was told to end has minutes to do so.
 PATIENCE_S = 240.0
 
@@ -56,6 +59,40 @@ def test_bytes_are_equal_for_any_number_of_processes(
         counts[jobs] = len(started)
     assert counts == {1: 0, 2: 2, 5: 7}
     assert len({log.read_bytes() for log in logs.values()}) == 1
+
+
+def test_evaluations_of_several_models_have_the_same_bytes_for_any_number_of_processes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started, logs = _count_workers(monkeypatch), []
+    monkeypatch.setattr(workers, "wait", newest_worker_first)
+    for jobs in (1, 2, 3):
+        logs.append(write_points_log(tmp_path / f"{jobs}.mcap"))
+        replay([logs[-1]], MODELS, "evaluate", jobs=jobs)
+        replay([logs[-1]], MODELS, "evaluate", jobs=jobs)  # it is complete: no worker starts
+    assert len(started) == 0 + 2 + 3
+    assert len({log.read_bytes() for log in logs}) == 1
+
+
+def test_interrupt_keeps_the_models_that_are_evaluated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = write_points_log(tmp_path / "lab.mcap")
+    results: list[Sequence[Any]] = []
+
+    def interrupted_later(receivers: Sequence[Any]) -> list[Any]:
+        if len(results) == 2:
+            raise KeyboardInterrupt
+        results.append(receivers)
+        return [_wait(receivers)[0]]
+
+    monkeypatch.setattr(workers, "wait", interrupted_later)
+    with pytest.raises(KeyboardInterrupt):
+        replay([log], MODELS, "evaluate", jobs=2)
+    with Session([log]) as session:
+        done = [run.run for run in session.runs() if run.stage == "evaluate"]
+    assert 1 <= len(done) < len(MODELS.models)
+    assert done == list(MODELS.models[: len(done)])
 
 
 def _count_workers(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
@@ -254,7 +291,7 @@ def test_slow_worker_leaves_almost_all_pieces_to_another(monkeypatch: pytest.Mon
 def test_result_that_cannot_be_sent_is_an_error() -> None:
     """The process that waits for the last result of a worker must get an answer."""
     ours, theirs = multiprocessing.Pipe()
-    workers._send(theirs, threading.Lock())  # type: ignore[arg-type]
+    workers._send(theirs, threading.Lock())
     assert ours.poll(PATIENCE_S)
     failure = ours.recv()
     assert "cannot pickle" in str(failure.error)

@@ -54,8 +54,8 @@ _SHARED: dict[str, cli.Option] = {
     ),
     "jobs": option(
         int | None, "--jobs", "N",
-        "Number of processes for detection in long logs (default: the number of cores). The results are the "
-        "same with any number.",
+        "Number of processes for long logs and several models (default: the number of cores). The results "
+        "are the same with any number.",
         min=1,
     ),
     "as_json": (cli.AsJson, False),

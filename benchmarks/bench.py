@@ -1,7 +1,7 @@
 """Run the benchmarks and print their results: ratios first.
 
     ./scripts/bench                      # all benchmarks, about half an hour
-    ./scripts/bench detection startup    # some benchmarks
+    ./scripts/bench detection answers    # some benchmarks
     ./scripts/bench --smoke              # with very little data: a test that they run, not a measurement
 
 Speed is a ratio within one run: contenders take turns at the same work, each in a separate process, round

@@ -59,7 +59,7 @@ def measure(options: argparse.Namespace) -> Report:
     for name, work in works.items():
         contenders = [
             Contender(who, _replay, (package.resolve(), *work))
-            for who, package in (("this", _ROOT), ("other", Path(options.other)))
+            for who, package in (("this", _ROOT), ("other", Path(options.other or _ROOT)))
         ]
         # The first turn also loads modules and the log.
         timings = race(contenders, 2, options.rounds)
@@ -67,8 +67,8 @@ def measure(options: argparse.Namespace) -> Report:
     return report
 
 
-def add_options(parser: argparse._ArgumentGroup) -> None:
-    parser.add_argument("--other", default=str(_ROOT), metavar="FOLDER", help="checkout to compare with")
+def add_options(_parser: argparse._ArgumentGroup) -> None:
+    """Add no options."""
 
 
 if __name__ == "__main__":

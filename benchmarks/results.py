@@ -38,7 +38,7 @@ BENCHMARKS = {
     "node_clock": "error of the clocks of nodes, in simulated exchanges",
     "node_cost": "processor time of a node and of its centre, beside a plain recording",
     "checkouts": "speed of this checkout, compared with another one",
-    "startup": "ipsys --help and ipsys info",
+    "answers": "start of commands, evaluations, report and calibrate-lab",
     "robot_run": "control error and true error of robots at waypoints, without and with faults",
     "joint": "error over the floor of calibrations, in simulated labs",
     "contradictions": "inputs that contradict the measurements: named, true error, coverage",
@@ -142,6 +142,7 @@ def parser_of(description: str | None, modules: list[ModuleType]) -> argparse.Ar
     )
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--smoke", action="store_true", help="next to no work: do they run?")
+    parser.add_argument("--other", metavar="FOLDER", help="checkout to compare with")
     for module in modules:
         module.add_options(parser.add_argument_group(module.__name__))
     return parser

@@ -11,7 +11,7 @@ import pytest
 
 BENCHMARKS = Path(__file__).resolve().parent.parent / "benchmarks"
 # Benchmarks of seconds, and a kind of measurement each; ./scripts/bench --smoke runs all of them.
-QUICK = ("detection", "log_write", "log_read", "table", "node_clock", "startup", "track_cost")
+QUICK = ("detection", "log_write", "log_read", "table", "node_clock", "answers", "track_cost")
 
 
 @pytest.mark.slow

@@ -138,7 +138,7 @@ def test_a_position_outside_the_measured_volume_says_so(tmp_path: Path) -> None:
 def test_a_model_out_of_a_log_predicts_what_it_predicted(ipsys: Ipsys, tmp_path: Path) -> None:
     """The tolerance is 1e-9 m, for every model in the table, by the numbers in the log."""
     from ipsys_log.models.rays import CalibrationPoints
-    from ipsys_log.models.table import MODELS, AppliedModel, fit_cameras, inputs
+    from ipsys_log.models.table import MODELS, AppliedModel, fit_cameras, inputs, predict_array
 
     log = made(tmp_path / "lab.mcap", labels=lambda n: ("train",))
     options = [option for name in MODELS for option in ("--model", name)]
@@ -158,7 +158,7 @@ def test_a_model_out_of_a_log_predicts_what_it_predicted(ipsys: Ipsys, tmp_path:
         fresh = fit_cameras(model.name, {"red": places})["red"]
         np.testing.assert_allclose(
             AppliedModel(model.name, camera).predict(points, world[:, 2]),
-            fresh.predict(inputs(model.name, points, world[:, 2])),
+            predict_array(fresh, inputs(model.name, points, world[:, 2])),
             atol=1e-9,
         )
 

@@ -69,10 +69,13 @@ def _parts(weights: Array, width: int) -> tuple[Array, Array]:
 
 def _slopes(weights: Array, inputs: Array, neurons: Array) -> Array:
     """Return the derivatives of the outputs by the weights, (b, weights, n)."""
-    _, out = _parts(weights, inputs.shape[1])
+    hidden, out = _parts(weights, inputs.shape[1])
     bent = (1 - neurons**2) * out[:, 1:, None]
-    by_hidden = (bent[:, :, None] * inputs.T).reshape(len(weights), -1, len(inputs))
-    return np.concatenate([by_hidden, np.ones((len(weights), 1, len(inputs))), neurons], axis=1)
+    slopes, edge = np.empty((*weights.shape, len(inputs))), hidden[0].size
+    by_hidden = slopes[:, :edge].reshape(*hidden.shape, -1)  # a view: to concatenate takes four times as long
+    np.multiply(bent[:, :, None], inputs.T, out=by_hidden)
+    slopes[:, edge], slopes[:, edge + 1 :] = 1.0, neurons
+    return slopes
 
 
 def train_networks(inputs: Array, targets: Array, weights: Array) -> tuple[Array, Array]:
@@ -106,7 +109,7 @@ def train_networks(inputs: Array, targets: Array, weights: Array) -> tuple[Array
             strength = _adapted(strength, curvature, misfit, weights, pull, most_noise)
         cost = (misfit**2).sum(axis=1) + strength * (weights**2 @ pull)
         gradient = np.einsum("bwn,bn->bw", slopes, misfit) + strength[:, None] * pull * weights
-        damped = curvature + _diagonal(strength[:, None] * pull + damping[:, None])
+        damped = _add_diagonal(curvature, strength[:, None] * pull + damping[:, None])
         tried = weights - np.linalg.solve(damped, gradient[:, :, None])[:, :, 0]
         tried_outputs, tried_neurons = evaluate_networks(tried, inputs)
         tried_cost = ((tried_outputs - targets) ** 2).sum(axis=1) + strength * (tried**2 @ pull)
@@ -137,8 +140,11 @@ def _relative_pulls(inputs: int, width: int) -> Array:
     return pull
 
 
-def _diagonal(values: Array) -> Array:
-    return values[:, :, None] * np.eye(values.shape[1])
+def _add_diagonal(matrices: Array, values: Array) -> Array:
+    """Return square matrices (b, w, w) with values (b, w) added to their diagonals."""
+    added = matrices.copy()
+    added.reshape(len(added), -1)[:, :: added.shape[1] + 1] += values
+    return added
 
 
 def _adapted(
@@ -158,7 +164,7 @@ def _determined(
 
     ``misfit`` is (b, n).
     """
-    inverse = np.linalg.inv(curvature + _diagonal(strength[:, None] * pull + 1e-12))
+    inverse = np.linalg.inv(_add_diagonal(curvature, strength[:, None] * pull + 1e-12))
     determined = len(pull) - strength * np.einsum("bii,i->b", inverse, pull)
     count = misfit.shape[1]
     noise = (misfit**2).sum(axis=1) / np.maximum(count - determined, 0.1 * count)
@@ -172,7 +178,7 @@ def _evidence(
     slopes, misfit = _slopes(weights, inputs, neurons), outputs - targets
     curvature = slopes @ slopes.transpose(0, 2, 1)
     _, noise = _determined(strength, curvature, misfit, pull, most_noise)
-    hessian = curvature + _diagonal(strength[:, None] * pull)
+    hessian = _add_diagonal(curvature, strength[:, None] * pull)
     cost = ((misfit**2).sum(axis=1) + strength * (weights**2 @ pull)) / noise
     log_det = np.linalg.slogdet(hessian / noise[:, None, None])[1]
     prior = len(pull) * np.log(strength / noise)

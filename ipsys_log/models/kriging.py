@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
-from scipy.linalg.lapack import dpotrf, dpotri, dtrtrs
+from scipy.linalg.lapack import dgels, dpotrf, dpotri, dtrtrs
 from scipy.optimize import minimize
 from scipy.stats.qmc import Sobol
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
@@ -37,15 +38,17 @@ class _Gls(NamedTuple):
     residuals: Array
     variance: float
 
-    def deviance(self) -> float:
-        """Return -2 log likelihood, without a constant, for the most likely variance (DACE)."""
-        log_det = 2 * np.log(np.diagonal(self.cholesky)).sum()
-        return float(len(self.cholesky) * np.log(self.variance) + log_det)
-
 
 def _terms(points: Array) -> Array:
     """Return the regressors of the linear trend (eq. 18)."""
     return np.hstack([np.ones((len(points), 1)), points])
+
+
+def _independent(terms: Array) -> Array:
+    """Return an orthonormal basis of the columns of terms (n, k)."""
+    basis, sizes, _ = np.linalg.svd(terms, full_matrices=False)
+    independent: Array = basis[:, sizes > len(terms) * _EPS * sizes[0]]
+    return independent
 
 
 def _squared_gaps(points: Array, isotropic: bool) -> Array:
@@ -59,10 +62,12 @@ def _correlations(logs: Array, gaps: Array) -> tuple[Array, Array]:
 
     A tiny constant on the diagonal keeps the matrix regular for nearly equal points, as in DACE.
     """
-    smooth = np.exp(-np.tensordot(np.exp(logs[: len(gaps)]), gaps, axes=1))
+    count = gaps.shape[1]
+    smooth = np.exp(-np.exp(logs[: len(gaps)]) @ gaps.reshape(len(gaps), -1)).reshape(count, count)
     noise = float(np.exp(logs[len(gaps)])) if len(logs) > len(gaps) else 0.0
-    count = len(smooth)
-    return smooth, smooth + (noise + (10 + count) * _EPS) * np.eye(count)
+    noisy = smooth.copy()
+    noisy.reshape(-1)[:: count + 1] += noise + (10 + count) * _EPS
+    return smooth, noisy
 
 
 def _gls(correlations: Array, terms: Array, targets: Array) -> _Gls | None:
@@ -79,29 +84,45 @@ def _gls(correlations: Array, terms: Array, targets: Array) -> _Gls | None:
 
 
 def _deviances(logs: Array, gaps: Array, terms: Array, targets: Array) -> Array:
-    """Return the deviances (k,) of targets (n, k) with the same correlations; infinite if these fail."""
+    """Return the deviances (k,) of targets (n, k) with the same correlations; infinite if these fail.
+
+    A deviance is -2 log likelihood, without a constant, for the most likely variance (DACE).
+    """
     lower, failed = dpotrf(_correlations(logs, gaps)[1], lower=1)
     if failed:
         return np.full(targets.shape[1], np.inf)
-    white, _ = dtrtrs(lower, np.hstack([terms, targets]), lower=1)
-    trends, values = np.hsplit(white, [terms.shape[1]])
-    residuals = values - trends @ np.linalg.lstsq(trends, values, rcond=None)[0]
+    residuals = _residuals(lower, terms, targets)
     variances = np.maximum((residuals**2).mean(axis=0), (10 * _EPS) ** 2)
     return np.asarray(len(lower) * np.log(variances) + 2 * np.log(np.diagonal(lower)).sum())
 
 
+def _residuals(lower: Array, terms: Array, targets: Array) -> Array:
+    """Return the whitened residuals of targets (n, k) about their trend; the terms must be independent."""
+    white, _ = dtrtrs(lower, np.hstack([terms, targets]), lower=1)
+    trends, values = white[:, : terms.shape[1]], white[:, terms.shape[1] :]
+    solved = dgels(trends, values)[1]
+    residuals: Array = values - trends @ solved[: terms.shape[1]]
+    return residuals
+
+
 def _deviance(logs: Array, gaps: Array, terms: Array, targets: Array) -> tuple[float, Array]:
-    """Return the deviance and its gradient by the logarithms of theta and the noise."""
+    """Return the deviance of targets (n, 1) and its gradient by the logarithms of theta and the noise."""
     smooth, noisy = _correlations(logs, gaps)
-    fitted = _gls(noisy, terms, targets)
-    if fitted is None:
+    lower, failed = dpotrf(noisy, lower=1)
+    if failed:
         return 1e25, np.zeros_like(logs)
-    half, _ = dpotri(fitted.cholesky, lower=1)  # the lower triangle of the inverse
-    weights, _ = dtrtrs(fitted.cholesky, fitted.residuals, lower=1, trans=1)
-    slope = half + np.tril(half, -1).T - np.outer(weights, weights) / fitted.variance
-    by_theta = -np.exp(logs[: len(gaps)]) * np.tensordot(gaps, slope * smooth, axes=2)
-    by_noise = [np.exp(logs[-1]) * np.trace(slope)] if len(logs) > len(gaps) else []
-    return fitted.deviance(), np.append(by_theta, by_noise)
+    residuals = _residuals(lower, terms, targets)
+    variance = max(float(np.vdot(residuals, residuals)) / len(lower), (10 * _EPS) ** 2)
+    deviance = len(lower) * math.log(variance) + 2 * float(np.log(np.diagonal(lower)).sum())
+    half, _ = dpotri(lower, lower=1)  # the lower triangle of the inverse; zeros above
+    weights = dtrtrs(lower, residuals, lower=1, trans=1)[0][:, 0]
+    # A gap on the diagonal is zero, so twice the lower triangle stands for the whole matrix.
+    slope = smooth * (2 * half.T - weights[:, None] * (weights / variance))
+    by_theta = -np.exp(logs[: len(gaps)]) * (gaps.reshape(len(gaps), -1) @ slope.reshape(-1))
+    if len(logs) == len(gaps):
+        return deviance, by_theta
+    trace = float(np.trace(half)) - float(weights @ weights) / variance
+    return deviance, np.append(by_theta, math.exp(logs[-1]) * trace)
 
 
 def fit_correlations(points: Array, targets: Array, noisy: bool) -> Array:
@@ -123,7 +144,7 @@ def fit_correlations(points: Array, targets: Array, noisy: bool) -> Array:
     Ou et al., Robotica 2023, below eq. (16) and (24). The concentrated likelihood is that of DACE (Lophaven
     et al. 2002, eq. 2.23). Cross-validation on the authors' pairs determines if theta is isotropic.
     """
-    gaps, terms = _squared_gaps(points, not noisy), _terms(points)
+    gaps, terms = _squared_gaps(points, not noisy), _independent(_terms(points))
     bounds = [_THETA[noisy]] * len(gaps) + [_NOISE] * noisy
     low, high = np.array(bounds).T
     starts = low + (high - low) * Sobol(len(bounds), scramble=False).random_base2(_STARTS_LOG2)
@@ -131,7 +152,14 @@ def fit_correlations(points: Array, targets: Array, noisy: bool) -> Array:
     best = []
     for own, column in zip(costs.T, targets.T, strict=True):
         optima = [
-            minimize(_deviance, starts[i], (gaps, terms, column), jac=True, bounds=bounds, method="L-BFGS-B")
+            minimize(
+                _deviance,
+                starts[i],
+                (gaps, terms, column[:, None]),
+                jac=True,
+                bounds=bounds,
+                method="L-BFGS-B",
+            )
             for i in np.argsort(own, kind="stable")[:_REFINED]
         ]
         best.append(min(optima, key=lambda result: float(result.fun)).x)

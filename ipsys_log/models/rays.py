@@ -6,13 +6,15 @@ is known, its position on the floor follows from the direction alone.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
 from ipsys_log.errors import FitError
 from ipsys_log.messages import Array
+from ipsys_log.models.plain_models import rigid_transform
 from ipsys_log.vision.lenses import intersect_height
-from ipsys_log.vision.poses import skew_matrices
+from ipsys_log.vision.poses import rotate, skew_matrices
 
 # Errors on the floor above this get less weight: the usual error of a tape.
 _USUAL_M = 0.005
@@ -22,6 +24,13 @@ _LENS_PULL_M = 0.1
 # Share of the tape in the variance of a residual. The share of the camera is about the same in the paper's
 # lab.
 _TAPE_SHARE = 0.5
+_MOST_STEPS = 200
+_FIRST_DAMPING = 1e-4
+# With this damping, the curvature is regular.
+_LEAST_DAMPING = 1e-10
+# The fit has converged if a step is expected to decrease the cost by less than this share: the step is then
+# about a millionth of the standard deviation.
+_STALLED = 1e-12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -113,44 +122,72 @@ def group_cameras(cameras: Sequence[CalibrationPoints]) -> list[list[int]]:
 
 
 def _fit_group(cameras: Sequence[CalibrationPoints]) -> list[CameraRays]:
-    # Late: most commands fit nothing, and scipy and scikit-learn take 1.5 s.
-    from scipy.optimize import least_squares
-    from scipy.spatial.transform import Rotation
+    """Fit cameras with common points by damped Gauss-Newton steps, with the curvature of the soft-L1 loss.
 
-    from ipsys_log.models.plain_models import rigid_transform
-
+    References
+    ----------
+    Triggs, McLauchlan, Hartley and Fitzgibbon, Bundle adjustment - a modern synthesis, 2000, sect. 4.3.
+    """
     starts = [rigid_transform(places.points_m, places.world_m) for places in cameras]
+    rays = [CameraRays(rotation, origin_m, np.zeros(3)) for rotation, origin_m in starts]
     weights = _weights([name for places in cameras for name in places.point_names])
-    first = np.concatenate([np.concatenate([np.zeros(3), t, np.zeros(3)]) for _, t in starts])
-    ends = np.cumsum([0, *(len(places.names) for places in cameras)])
-
-    def camera_rays(values: Array) -> list[CameraRays]:
-        return [
-            CameraRays(Rotation.from_rotvec(v[:3]).as_matrix() @ start, v[3:6], v[6:])
-            for v, (start, _) in zip(values.reshape(-1, 9), starts, strict=True)
-        ]
-
-    def residuals(values: Array) -> Array:
-        offsets = [_offsets(p, b) for p, b in zip(cameras, camera_rays(values), strict=True)]
-        pulls = values.reshape(-1, 9)[:, 6:] * _LENS_PULL_M
-        return np.concatenate([(weights @ np.vstack(offsets)).reshape(-1), pulls.reshape(-1)])
-
-    def jacobian(values: Array) -> Array:
-        rows = np.zeros((ends[-1], 2, len(values)))
-        pulls = np.zeros((3 * len(cameras), len(values)))
-        for n, (places, b) in enumerate(zip(cameras, camera_rays(values), strict=True)):
-            rows[ends[n] : ends[n + 1], :, 9 * n : 9 * n + 9] = _slopes(places, b, values[9 * n : 9 * n + 3])
-            pulls[3 * n : 3 * n + 3, 9 * n + 6 : 9 * n + 9] = _LENS_PULL_M * np.eye(3)
-        return np.vstack([np.tensordot(weights, rows, axes=1).reshape(-1, len(values)), pulls])
-
-    solved = least_squares(
-        residuals, first, jacobian, loss="soft_l1", f_scale=_USUAL_M, x_scale="jac", max_nfev=200
-    )
-    if not np.isfinite(solved.x).all():
+    residuals = _residuals(cameras, rays, weights)
+    cost, damping = _soft_cost(residuals), _FIRST_DAMPING
+    if not np.isfinite(cost):
         raise FitError(
             "the rays of the camera do not fit the calibration points; check the heights of the points"
         )
-    return camera_rays(solved.x)
+    for _ in range(_MOST_STEPS):
+        slopes = _jacobian(cameras, rays, weights)
+        shares = 1 + (residuals / _USUAL_M) ** 2
+        gradient = (residuals / np.sqrt(shares)) @ slopes
+        curvature = (slopes.T * shares**-1.5) @ slopes
+        while True:
+            damped = curvature + damping * np.diag(curvature.diagonal())
+            step = np.asarray(np.linalg.solve(damped, -gradient), dtype=np.float64)
+            if -(gradient @ step) <= _STALLED * cost:
+                return rays
+            moved = _move(rays, step)
+            residuals = _residuals(cameras, moved, weights)
+            moved_cost = _soft_cost(residuals)
+            if moved_cost <= cost:
+                break
+            damping *= 10
+        rays, cost, damping = moved, moved_cost, max(damping / 10, _LEAST_DAMPING)
+    return rays
+
+
+def _soft_cost(residuals: Array) -> float:
+    """Return half the soft-L1 loss of residuals in m, in m^2."""
+    return float(_USUAL_M**2 * (np.sqrt(1 + (residuals / _USUAL_M) ** 2) - 1).sum())
+
+
+def _move(rays: Sequence[CameraRays], step: Array) -> list[CameraRays]:
+    """Return cameras after a turn in the world, a shift and a change of the lens, nine numbers for each."""
+    steps = step.reshape(-1, 9)
+    turns = rotate(steps[:, :3])
+    return [
+        CameraRays(turn @ own.rotation, own.origin_m + change[3:6], own.lens + change[6:])
+        for own, turn, change in zip(rays, turns, steps, strict=True)
+    ]
+
+
+def _residuals(cameras: Sequence[CalibrationPoints], rays: Sequence[CameraRays], weights: Array) -> Array:
+    """Return the weighted errors on the floor, and the pulls of the lens corrections, in m."""
+    offsets = np.vstack([_offsets(places, own) for places, own in zip(cameras, rays, strict=True)])
+    pulls = _LENS_PULL_M * np.concatenate([own.lens for own in rays])
+    return np.concatenate([(weights @ offsets).reshape(-1), pulls])
+
+
+def _jacobian(cameras: Sequence[CalibrationPoints], rays: Sequence[CameraRays], weights: Array) -> Array:
+    """Return the derivative of :func:`_residuals` by the numbers of :func:`_move`."""
+    rows, size, edge = np.zeros((len(weights), 2, 9 * len(rays))), 9 * len(rays), 0
+    for n, (places, own) in enumerate(zip(cameras, rays, strict=True)):
+        end = edge + len(places.names)
+        rows[edge:end, :, 9 * n : 9 * n + 9] = _slopes(places, own)
+        edge = end
+    pulls = _LENS_PULL_M * np.eye(size)[np.arange(size) % 9 >= 6]
+    return np.vstack([(weights @ rows.reshape(len(rows), -1)).reshape(-1, size), pulls])
 
 
 def _offsets(places: CalibrationPoints, camera_rays: CameraRays) -> Array:
@@ -159,8 +196,8 @@ def _offsets(places: CalibrationPoints, camera_rays: CameraRays) -> Array:
     return (intersect_height(camera_rays.origin_m, rays, places.world_m[:, 2]) - places.world_m)[:, :2]
 
 
-def _slopes(places: CalibrationPoints, camera_rays: CameraRays, turn: Array) -> Array:
-    """Return the derivative of :func:`_offsets` by rotation vector, origin and lens, (n, 2, 9)."""
+def _slopes(places: CalibrationPoints, camera_rays: CameraRays) -> Array:
+    """Return the derivative of :func:`_offsets` by a turn in the world, origin and lens, (n, 2, 9)."""
     points_m = places.points_m
     rays = directions(points_m, camera_rays.lens) @ camera_rays.rotation.T
     along = (places.world_m[:, 2] - camera_rays.origin_m[2]) / rays[:, 2]
@@ -168,24 +205,10 @@ def _slopes(places: CalibrationPoints, camera_rays: CameraRays, turn: Array) -> 
     on_plane[:, 0, 0] = on_plane[:, 1, 1] = 1.0
     on_plane[:, :, 2] = -rays[:, :2] / rays[:, 2:]
     by_ray = along[:, None, None] * on_plane
-    by_turn = -by_ray @ skew_matrices(rays) @ _left_jacobian(turn)
+    by_turn = -by_ray @ skew_matrices(rays)
     u, v = points_m[:, 0] / points_m[:, 2], points_m[:, 1] / points_m[:, 2]
     by_lens = by_ray @ camera_rays.rotation[:, :2] @ _lens_terms(u, v)
     return np.concatenate([by_turn, on_plane, by_lens], axis=2)
-
-
-def _left_jacobian(turn: Array) -> Array:
-    """Return the left Jacobian of a rotation by its rotation vector (3,) (Barfoot 2017, eq. 7.77).
-
-    ``left_jacobians`` differs in the last bits, so rayplane would have another output with it.
-    """
-    angle = float(np.linalg.norm(turn))
-    if angle < 1e-8:
-        return np.eye(3)
-    skew = skew_matrices(turn[None])[0]
-    first, second = (1 - np.cos(angle)) / angle**2, (angle - np.sin(angle)) / angle**3
-    jacobian: Array = np.eye(3) + first * skew + second * skew @ skew
-    return jacobian
 
 
 def _weights(names: Sequence[str]) -> Array:
@@ -194,11 +217,20 @@ def _weights(names: Sequence[str]) -> Array:
     The residuals of a calibration point in k cameras share the tape's error T. Each also has the camera's own
     error C. Their mean has the variance T + C / k, and their differences have the variance C.
     """
+    rows_of: dict[str, list[int]] = {}
+    for row, name in enumerate(names):
+        rows_of.setdefault(name, []).append(row)
     weights = np.eye(len(names))
-    for name in {name for name in names if names.count(name) > 1}:
-        rows = np.flatnonzero([other == name for other in names])
-        basis = np.linalg.qr(np.column_stack([np.ones(len(rows)), np.eye(len(rows))[:, 1:]]))[0].T
-        variances = np.full(len(rows), 1 - _TAPE_SHARE)
-        variances[0] += len(rows) * _TAPE_SHARE
-        weights[np.ix_(rows, rows)] = basis / np.sqrt(variances)[:, None]
+    for rows in rows_of.values():
+        if len(rows) > 1:
+            weights[np.ix_(rows, rows)] = _weights_of_a_point(len(rows))
+    return weights
+
+
+@cache
+def _weights_of_a_point(count: int) -> Array:
+    basis = np.linalg.qr(np.column_stack([np.ones(count), np.eye(count)[:, 1:]]))[0].T
+    variances = np.full(count, 1 - _TAPE_SHARE)
+    variances[0] += count * _TAPE_SHARE
+    weights: Array = basis / np.sqrt(variances)[:, None]
     return weights

@@ -99,7 +99,7 @@ MODELS = (
     "best",
 )
 
-# Models that are applied without scikit-learn, so that live positions begin earlier.
+# Models that are fitted and applied without scikit-learn: its import takes longer than a hundred fits.
 _PLAIN = {"rigid": Rigid, "poly": Polynomial}
 
 # Models of the corners of markers. The fit estimates all cameras together, see ipsys_log.calibration.joint.
@@ -156,6 +156,10 @@ def create(name: str) -> Any:
     return Pipeline(steps)
 
 
+def _new(name: str) -> Any:
+    return _PLAIN[name]() if name in _PLAIN else create(name)
+
+
 def _create_part(name: str) -> Any:
     create_estimator = MODEL_PARTS[name].create
     assert create_estimator is not None, name
@@ -196,7 +200,7 @@ def predict_array(estimator: Any, points: NDArray[np.float64]) -> NDArray[np.flo
 
 
 def fit_cameras(name: str, cameras: Mapping[str, CalibrationPoints]) -> dict[str, Any]:
-    """Fit an estimator for each camera to the calibration points that the camera measured.
+    """Fit a model for each camera to the calibration points that it measured, for :func:`predict_array`.
 
     The fit of physical models uses all cameras at once: points that two cameras measured tie them together.
 
@@ -205,12 +209,13 @@ def fit_cameras(name: str, cameras: Mapping[str, CalibrationPoints]) -> dict[str
     FitError
         The calibration points do not determine a model. The text names the camera.
     """
-    models = {camera: create(name) for camera in cameras}
-    if (fit_jointly := getattr(create(name), "fit_jointly", None)) is not None:
+    models = {camera: _new(name) for camera in cameras}
+    if (fit_jointly := getattr(_new(name), "fit_jointly", None)) is not None:
         return dict(zip(models, fit_jointly([*models.values()], [*cameras.values()]), strict=True))
     for camera, places in cameras.items():
         try:
-            models[camera].fit(inputs(name, places.points_m, places.world_m[:, 2]), places.world_m)
+            fit = models[camera].fit_array if name in _PLAIN else models[camera].fit
+            fit(inputs(name, places.points_m, places.world_m[:, 2]), places.world_m)
         except FitError as error:
             raise FitError(f"camera {camera}: {error}") from error
     return models
@@ -219,7 +224,7 @@ def fit_cameras(name: str, cameras: Mapping[str, CalibrationPoints]) -> dict[str
 def group_dependent_cameras(name: str, cameras: Mapping[str, CalibrationPoints]) -> list[list[str]]:
     """Return groups of cameras whose models depend on common calibration points."""
     names = list(cameras)
-    if not hasattr(create(name), "fit_jointly"):
+    if not hasattr(_new(name), "fit_jointly"):
         return [[camera] for camera in names]
     return [[names[i] for i in group] for group in group_cameras(list(cameras.values()))]
 
@@ -251,7 +256,7 @@ def restore(name: str, arrays: Mapping[str, NDArray[np.float64]]) -> Any:
     IpsysError
         The model is unknown, or a parameter is missing.
     """
-    estimator = _PLAIN[name]() if name in _PLAIN else create(name)
+    estimator = _new(name)
     for part, (prefix, step) in zip(name.split("+"), _steps(estimator), strict=True):
         step.n_features_in_ = 4 if MODEL_PARTS[part].reads_height else 3
         for attribute in step.fitted:

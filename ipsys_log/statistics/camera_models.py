@@ -1,6 +1,7 @@
 """Fitted models of cameras, each with the covariance of its positions."""
 
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,7 +9,7 @@ from numpy.typing import NDArray
 from ipsys_log.errors import FitError
 from ipsys_log.messages import Array, CameraModel, Model, Noise, Pair, Parameter
 from ipsys_log.models.rays import CalibrationPoints
-from ipsys_log.models.table import fit_cameras, inputs, min_pairs, parameters, reads_height
+from ipsys_log.models.table import fit_cameras, inputs, min_pairs, parameters, predict_array, reads_height
 from ipsys_log.models.uncertainty import Uncertainty, estimate_uncertainty, ruler_sigmas
 from ipsys_log.statistics.cross_validation import gather_points, make_folds, predict_without
 
@@ -107,15 +108,14 @@ def _left_out(
 
 def _noise(
     name: str,
-    estimator: object,
+    estimator: Any,
     places: CalibrationPoints,
     tape_m2: Array,
     without: Array,
     groups: NDArray[np.int64],
 ) -> Noise | None:
     def predict(points_m: Array, heights_m: Array) -> Array:
-        world_m: Array = estimator.predict(inputs(name, points_m, heights_m))  # type: ignore[attr-defined]
-        return world_m
+        return predict_array(estimator, inputs(name, points_m, heights_m))
 
     uncertainty: Uncertainty = estimate_uncertainty(
         predict, places.points_m, places.world_m, tape_m2, without, groups, reads_height(name)

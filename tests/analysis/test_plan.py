@@ -14,7 +14,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.live_runs.survey.floor_plan import view_of_model
 from ipsys_log.messages import CameraCalibration, Pair
 from ipsys_log.models.rays import CalibrationPoints
-from ipsys_log.models.table import fit_cameras, inputs
+from ipsys_log.models.table import fit_cameras, inputs, predict_array
 from ipsys_log.models.uncertainty import Uncertainty
 from ipsys_log.statistics.camera_models import fit_model
 from ipsys_log.statistics.plan import FittedCamera, MeasurementPlan, mean_length, plan_points
@@ -169,7 +169,7 @@ def true_mean_error_m(cameras: list[Camera], pairs: dict[str, list[Pair]], model
     for row, camera in zip(errors_m, cameras, strict=True):
         shown = camera.shows(floor_m)
         points_m = camera.see(floor_m[shown], None)
-        predicted_m = estimators[camera.name].predict(inputs(model, points_m, floor_m[shown, 2]))
+        predicted_m = predict_array(estimators[camera.name], inputs(model, points_m, floor_m[shown, 2]))
         row[shown] = np.linalg.norm((predicted_m - floor_m[shown])[:, :2], axis=1)
     nearer, each = (floor_m[:, 0] > WIDTH_M / 2).astype(int), np.arange(len(floor_m))
     first_m, second_m = errors_m[nearer, each], errors_m[1 - nearer, each]

@@ -38,13 +38,14 @@ _NEEDED = {
     "info LOG --runs": {"mcap", "numpy", "cv2", _STAGES},
     "check LOG": {"mcap", "numpy", "cv2", _STAGES},
     "replay LOG": {"mcap", "numpy", "cv2", _STAGES, _REPLAY},
+    "evaluate LOG --model poly --seed 1 -o NEW": {"mcap", "numpy", "cv2", "scipy", _STAGES, _REPLAY},
 }
 
 
 @pytest.mark.slow  # each case starts the command in a new process
 @pytest.mark.parametrize("words", _NEEDED)
 def test_command_imports_what_it_needs(words: str, replayed_lab: Path, tmp_path: Path) -> None:
-    places = {"LOG": replayed_lab, "NONE": tmp_path / "none.mcap"}
+    places = {"LOG": replayed_lab, "NONE": tmp_path / "none.mcap", "NEW": tmp_path / "new.mcap"}
     before = replayed_lab.read_bytes()
     arguments = [str(places.get(word, word)) for word in words.split()]
     command = [sys.executable, "-c", _RUN, *arguments]

@@ -10,9 +10,9 @@ import pytest
 
 from ipsys_log.calibration.joint import solver
 from ipsys_log.calibration.joint.diagnosis import find_faults
-from ipsys_log.calibration.joint.fit import JointFit, fit_jointly
+from ipsys_log.calibration.joint.fit import JointFit, fit_jointly, refit_without
 from ipsys_log.calibration.joint.from_messages import gather_observations
-from ipsys_log.calibration.joint.observations import Observations
+from ipsys_log.calibration.joint.observations import Observations, without_points
 from ipsys_log.calibration.joint.settings import JointSettings
 from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.errors import FitError
@@ -76,6 +76,18 @@ def test_camera_positions_are_as_accurate_as_stated(driven: tuple[GeometricLab, 
         covariance = fit.covariance[rows, rows]
         assert error_m @ np.linalg.solve(covariance, error_m) < 22.0
         assert np.linalg.norm(error_m[:2]) < 0.005
+
+
+def test_refit_without_points_is_a_fit_to_the_others(driven: tuple[GeometricLab, JointFit]) -> None:
+    _, fit = driven
+    left_out = {point.name for point in fit.observations.points[::3]}
+    refit = refit_without(fit, left_out)
+    anew = fit_jointly(without_points(fit.observations, left_out), COARSE)
+    for block in fit.problem.layout.cameras:
+        origin = slice(block.start + 3, block.start + 6)
+        shift_m = np.abs(refit.state.values - anew.state.values)[origin]
+        assert (shift_m < 0.02 * np.sqrt(anew.covariance.diagonal()[origin])).all()
+    assert np.abs(refit.state.positions_m - anew.state.positions_m).max() < 1e-4
 
 
 def test_exchanged_robots_are_named() -> None:

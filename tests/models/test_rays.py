@@ -9,9 +9,10 @@ import pytest
 import scipy.io
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.optimize import least_squares
 from sklearn.model_selection import KFold
 
-from ipsys_log.models.rays import CalibrationPoints
+from ipsys_log.models.rays import _USUAL_M, CalibrationPoints, _move, _residuals, _weights, fit_rays
 from ipsys_log.models.table import create, fit_cameras, group_dependent_cameras, inputs
 from tests import labs
 
@@ -32,6 +33,34 @@ def test_noise_free_data_recover_pose_lens_and_points(seed: int) -> None:
     np.testing.assert_allclose(model.lens_, np.array(camera.lens), atol=2e-4)
     found = model.predict(inputs("rayplane", camera.see(elsewhere, rng), elsewhere[:, 2]))
     assert error_cm(found, elsewhere) < 0.01
+
+
+def test_tied_cameras_are_at_the_optimum_of_scipy() -> None:
+    rng = np.random.default_rng(5)
+    left, right = labs.camera(rng, 0.9), labs.camera(rng, 2.0)
+    world = [labs.places(rng, 12, 0.9), labs.places(rng, 12, 2.0)]
+    shared = labs.places(rng, 8, 1.45)
+    measured, _ = labs.measure(shared, rng, 0.01)
+    measured[0, 0] += 0.3
+    cameras = [
+        CalibrationPoints(
+            camera.see(np.vstack([own, shared]), rng),
+            np.vstack([labs.measure(own, rng, 0.01)[0], measured]),
+            (*(f"{n}{camera.origin_m}" for n in range(12)), *map(str, range(8))),
+        )
+        for camera, own in zip((left, right), world, strict=True)
+    ]
+    rays, weights = fit_rays(cameras), _weights([name for places in cameras for name in places.names])
+    solved = least_squares(
+        lambda step: _residuals(cameras, _move(rays, step), weights),
+        rng.normal(0, 0.003, 18),
+        loss="soft_l1",
+        f_scale=_USUAL_M,
+        ftol=1e-14,
+        xtol=1e-14,
+        gtol=1e-14,
+    )
+    np.testing.assert_allclose(solved.x, 0.0, atol=2e-5)
 
 
 def test_depths_do_not_matter_where_the_height_is_known() -> None:

@@ -168,7 +168,6 @@ def ready_to_measure(
 
     ``page`` is the address and the port of the measuring page; None: there is no page.
     """
-    import ipsys_log.models.closed_form  # noqa: F401 - the outliers need it, and no frame must wait for it
     from ipsys_log.capture.live_plan import check_model, check_start
     from ipsys_log.engine.request import fitted_in
     from ipsys_log.live_runs.survey.entry import check_references

@@ -31,7 +31,6 @@ from ipsys_log.messages.channels import TRACKS
 from ipsys_log.messages.rig_file import load_rig
 from ipsys_log.units import NS_PER_S
 from tests.conftest import Ipsys
-from tests.test_measure_now import Lab, measuring
 
 # a limit for one command on a busy machine; a free machine needs seconds
 PATIENCE_S = 900
@@ -235,23 +234,3 @@ def test_every_command_of_the_first_day_works_without_hardware(day: Day) -> None
     # These have tests of their own: a page, public data, weeks of logs, robots, workers, and nodes.
     day.commands |= {"setup", "import", "drift", "drive", "batch", "node"}
     assert day.commands == {name for names in panels().values() for name in names}
-
-
-@pytest.mark.slow
-def test_points_of_the_simulated_lab_are_measured_on_the_page(tmp_path: Path, ipsys: Ipsys) -> None:
-    """Measure with live cameras as on a phone; the markers stay, so no step is urgent."""
-    assert ipsys("init", tmp_path / "lab.toml", "--simulated").code == 0
-    rows = sheet_rows(tmp_path / "lab_tape.csv")
-    assert (
-        ipsys("record", "--rig", tmp_path / "lab.toml", "-o", tmp_path / "l.mcap", "--seconds", 1).code == 0
-    )
-    log = tmp_path / "places.mcap"
-    with measuring(Lab(tmp_path / "lab.toml", tmp_path / "l.mcap", rows), log) as (program, page):
-        for row in rows[:16]:
-            assert "saved" in page.measure(row)
-        program.terminate()
-        program.communicate(timeout=240)
-    with Session([log]) as session:
-        assert len(session.payloads(["/measurements"])) == 16
-    assert ipsys("replay", log, "--model", "best").code == 0
-    assert np.median(errors_m(log, "best")) < 0.02

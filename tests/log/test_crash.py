@@ -96,11 +96,11 @@ def test_append_to_a_larger_log(tmp_path: Path) -> None:
     chance = random.Random(3)
     rows = [("/image/a", k * 10**8, k, chance.randbytes(40_000)) for k in range(60)]
     path = create(tmp_path / "session.mcap", rows)
-    for number in range(3):
+    for number in range(2):
         old = path.read_bytes()
         more = [(f"/runs/{number}/{k % 3}", k * 10**8, k, chance.randbytes(3_000)) for k in range(400)]
         operations = record_append(path, more)
-        check_append(tmp_path / f"crashed{number}", old, path.read_bytes(), operations, tries=60)
+        check_append(tmp_path / f"crashed{number}", old, path.read_bytes(), operations, tries=20)
 
 
 def is_repaired(path: Path) -> bool:

@@ -162,17 +162,6 @@ def test_recording_cut_at_every_point(tmp_path: Path) -> None:
     assert len(kept) > 5
 
 
-@pytest.mark.slow
-def test_larger_recording(tmp_path: Path) -> None:
-    chance = random.Random(6)
-    rows: list[Row] = []
-    for k in range(120):
-        rows.append((f"/image/{k % 3}", k * 10**8, k, chance.randbytes(20_000)))
-        rows.append(("/points", k * 10**8 + 1, k, chance.randbytes(50)))
-    operations = record_recording(tmp_path / "recording.mcap", rows)
-    check_recording(tmp_path / "crashed", rows, operations, tries=10)
-
-
 def test_results_of_a_frame_are_never_stored_without_the_frame(tmp_path: Path) -> None:
     """At any kill of a recorder, the flushed messages are there, and no others."""
     rows: list[Row] = [("/points", 0, 0, b"a note before the first frame")]

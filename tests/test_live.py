@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -160,12 +159,8 @@ def test_one_run_under_two_names_is_the_same(
     assert "name a second log" in ipsys("diff", log).err
 
 
-def test_point_measured_later_is_reported_and_no_difference(
-    ipsys: Ipsys, lab_log: Path, tmp_path: Path
-) -> None:
-    log = tmp_path / "lab.mcap"
-    shutil.copy(lab_log, log)
-    pipeline.replay([log], Request())
+def test_point_measured_later_is_reported_and_no_difference(ipsys: Ipsys, replayed_lab: Path) -> None:
+    log = replayed_lab
     with Session([log]) as session:
         last = session.payloads(["/measurements"])[-1]
         time_ns = session.end_ns + 1

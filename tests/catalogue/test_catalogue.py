@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import fsspec
-import numpy as np
 import pandas as pd
 import pytest
 
@@ -132,43 +131,6 @@ def test_only_new_and_changed_logs_are_read(folder: Path, tmp_path: Path) -> Non
     # An update gives the same rows as a new catalogue.
     update_catalogue(folder, tmp_path / "again.parquet")
     assert target.read_bytes() == (tmp_path / "again.parquet").read_bytes()
-
-
-@pytest.mark.slow
-def test_newer_stages_change_the_states_in_a_catalogue(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def outdated() -> tuple[list[str], str]:
-        row = rows_of(tmp_path / "catalogue.parquet")["2026/golden.mcap"]
-        return list(row["outdated_runs"]), ", ".join(one["state"] for one in row["runs"])
-
-    update_catalogue(folder, tmp_path / "catalogue.parquet")
-    # The golden log is of an earlier version.
-    assert outdated()[0] == ["best", "edges", "poly", "rigid"]
-    assert "this is rigid 99" not in outdated()[1]
-    monkeypatch.setitem(VERSIONS, "rigid", 99)
-    assert update_catalogue(folder, tmp_path / "catalogue.parquet").read == 3
-    assert "this is rigid 99" in outdated()[1]
-
-
-@pytest.mark.slow
-def test_duckdb_and_pandas_answer_the_same_question(folder: Path, tmp_path: Path) -> None:
-    """Compare the errors of models over all logs, as the page about the catalogue does."""
-    import duckdb  # late: it complains at the end about objects that the garbage collection has exempted
-
-    target = tmp_path / "catalogue.parquet"
-    update_catalogue(folder, target)
-    ask: Any = duckdb.sql
-    found = ask(
-        "SELECT e.model, avg(e.mean_m) FROM (SELECT unnest(evaluations) AS e FROM read_parquet("
-        f"'{target}')) WHERE e.dimensions = '2d' AND e.scheme = 'held_out' GROUP BY e.model ORDER BY e.model"
-    ).fetchall()
-    table = pd.read_parquet(target).explode("evaluations").dropna(subset="evaluations")
-    rows = pd.DataFrame(table["evaluations"].tolist())
-    wanted = rows[(rows.dimensions == "2d") & (rows.scheme == "held_out")].groupby("model").mean_m.mean()
-    assert [name for name, _ in found] == [*wanted.index]
-    assert len(found) >= 2
-    np.testing.assert_allclose([mean for _, mean in found], wanted)
 
 
 def test_questions_of_the_documentation_have_answers(

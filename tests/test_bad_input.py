@@ -7,7 +7,6 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +15,7 @@ import numpy as np
 import pytest
 
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import CompressedImage, Distance, Measurement, Message, Rig, RigMarker
+from ipsys_log.messages import CompressedImage, Message, Rig, RigMarker
 from ipsys_log.messages.channels import MARKERS, RUN_EVENTS
 from ipsys_log.units import format_time
 from tests.changed_logs import rewrite
@@ -89,20 +88,6 @@ def test_a_calibration_of_another_size(ipsys: Ipsys, lab: Path, corners: str) ->
     assert "camera red: its frames are 960 x 540 px, its calibration is for 1920 x 1080" in line
 
 
-def renumber(marker_id: int) -> Callable[[Message], Message]:
-    def change(message: Message) -> Message:
-        if isinstance(message.payload, Measurement) and message.payload.id.endswith("3"):
-            return replace(message, payload=replace(message.payload, marker_id=marker_id))
-        return message
-
-    return change
-
-
-def test_an_unknown_marker_id_in_a_measurement(ipsys: Ipsys, lab: Path) -> None:
-    line = refused(ipsys, lab, "replay", rewrite(lab, renumber(77)))
-    assert "marker 77, which is not in the rig" in line
-
-
 def test_only_markers_that_are_not_in_the_rig(ipsys: Ipsys, lab: Path) -> None:
     def other_rig(message: Message) -> Message:
         if isinstance(message.payload, Rig):
@@ -165,77 +150,9 @@ def test_two_markers_of_one_id_in_a_frame(ipsys: Ipsys, lab: Path) -> None:
     assert "/cameras/red/image: marker 4 is seen" in line
     assert format_time(time_ns) in line
     assert "--skip-ambiguous" in line
-    done = ipsys("replay", log, "--skip-ambiguous")
+    done = ipsys("detect", log, "--skip-ambiguous")
     assert done.code == 0
     assert "1 x ambiguous marker" in done.err
-
-
-@pytest.mark.parametrize(
-    ("model", "places", "needed"), [("poly", 9, 10), ("rigid+poly", 9, 10), ("rigid", 2, 3)]
-)
-def test_too_few_points_for_a_model_are_refused(
-    ipsys: Ipsys, data: Path, tmp_path: Path, model: str, places: int, needed: int
-) -> None:
-    imsel = tmp_path / "imsel.mcap"
-    ipsys("import", "imsel", data / "imsel", "-o", imsel)
-
-    def few(message: Message) -> Message | None:
-        payload = message.payload
-        if isinstance(payload, Measurement) and int(payload.id[-2:]) >= places:
-            return None
-        return message
-
-    log = rewrite(imsel, few)
-    line = refused(ipsys, log, "fit", log, "--model", model)
-    assert f"{model} needs at least {needed} calibration points, found {places}" in line
-
-
-def test_places_on_a_line(ipsys: Ipsys, data: Path, tmp_path: Path) -> None:
-    imsel = tmp_path / "imsel.mcap"
-    ipsys("import", "imsel", data / "imsel", "-o", imsel)
-
-    def in_a_row(message: Message) -> Message:
-        payload = message.payload
-        if isinstance(payload, Measurement) and payload.point is not None:
-            return replace(message, payload=replace(payload, point=replace(payload.point, y_m=1.0, z_m=0.0)))
-        return message
-
-    log = rewrite(imsel, in_a_row)
-    assert "on one line" in refused(ipsys, log, "fit", log, "--model", "rigid")
-
-
-def test_an_impossible_triangle(ipsys: Ipsys, lab: Path) -> None:
-    def too_short(message: Message) -> Message:
-        payload = message.payload
-        if isinstance(payload, Measurement) and payload.distances:
-            distances = (Distance("A", 0.4), Distance("B", 0.5))
-            return replace(message, payload=replace(payload, id="s_first", distances=distances))
-        return message
-
-    seen: list[bool] = []
-
-    def once(message: Message) -> Message:
-        if isinstance(message.payload, Measurement) and not seen:
-            seen.append(True)
-            return too_short(message)
-        return message
-
-    log = rewrite(lab, once)
-    line = refused(ipsys, log, "replay", log)
-    assert "measurement s_first" in line
-    assert "d1 = 0.4000 m and d2 = 0.5000 m do not meet, because AB is 2.4384 m" in line
-
-
-def test_two_cameras_of_one_name(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
-    rig = tmp_path / "lab.toml"
-    rig.write_text(
-        'name = "a"\ndictionary = "DICT_4X4_100"\nmarker_length_m = 0.2\n'
-        '[[cameras]]\nname = "red"\n[[cameras]]\nname = "red"\n'
-    )
-    assert "two cameras have the name 'red'" in refused(ipsys, lab, "replay", lab, "--rig", rig)
-    other = rewrite(lab, lambda message: message)
-    line = refused(ipsys, lab, "replay", lab, other, "-o", tmp_path / "out.mcap")
-    assert "two cameras have the same name" in line
 
 
 @pytest.mark.parametrize("damage", first_fast(2, ["cut", "zeros", "empty", "noise"]))
@@ -261,7 +178,7 @@ def test_a_corrupt_jpeg_in_the_middle(ipsys: Ipsys, lab: Path, damage: str) -> N
         return replace(message, payload=replace(message.payload, data=hurt(message.payload.data)))
 
     log = rewrite(lab, change)
-    done = ipsys("replay", log)
+    done = ipsys("detect", log)
     assert done.code == 0, done.err
     assert "1 x corrupt frame, first: /cameras/white/image" in done.err
     assert f"{format_time(times[10])} ({times[10]} ns)" in done.err

@@ -11,6 +11,9 @@ import pytest
 import typer
 
 from ipsys_log.app.cli.app import app
+from ipsys_log.errors import IpsysError
+from ipsys_log.log.reader import LogReader
+from ipsys_log.plain_text import shell_words
 from tests.conftest import ROOT
 from tests.site_pages import staging
 
@@ -66,3 +69,11 @@ def test_wrong_commands_are_found() -> None:
 def test_commands_of_the_pages_are_seen() -> None:
     pages = [path.read_text(encoding="utf-8") for path in staging["pages"]() if path.name != "commands.md"]
     assert sum(len(list(documented(text))) for text in pages) > 300
+
+
+def test_suggested_command_has_the_name_as_one_word(tmp_path: Path) -> None:
+    log = tmp_path / "a b.mcap"
+    log.write_bytes(b"\x89MCAP0\r\n" + bytes(100))
+    with pytest.raises(IpsysError, match=re.escape(f"ipsys repair '{log}'")):
+        LogReader(log)
+    assert shell_words(log, "c.mcap") == f"'{log}' c.mcap"

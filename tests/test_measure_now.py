@@ -185,48 +185,6 @@ def test_measured_points_survive_a_kill(ipsys: Ipsys, still_lab: Lab, tmp_path: 
             assert len(inside) > 5
 
 
-@pytest.mark.slow
-def test_kill_before_the_first_point_leaves_rig_and_intrinsics(
-    ipsys: Ipsys, still_lab: Lab, tmp_path: Path
-) -> None:
-    log = tmp_path / "places.mcap"
-    with measuring(still_lab, log) as (program, _):
-        program.kill()
-        program.communicate(timeout=PATIENCE_S)
-    assert ipsys("repair", log).code == 0
-    with Session([log]) as session:
-        assert session.count("/rig") == 1
-        assert len(session.calibrations) == 3
-
-
-def test_existing_log_is_kept_without_force(ipsys: Ipsys, still_lab: Lab, tmp_path: Path) -> None:
-    log = tmp_path / "places.mcap"
-    log.write_bytes(b"years of data")
-    done = ipsys(*HEAD, still_lab.rig, "--calibration", still_lab.lenses, "-o", log)
-    assert done.code == 1
-    assert "exists already; give another name, or --force" in done.err
-    assert log.read_bytes() == b"years of data"
-
-
-@pytest.mark.parametrize(
-    ("given", "said"),
-    [
-        (["measure", "LOG", "--force"], "--force is only for --csv; leave it out"),
-        ([*HEAD, "RIG", "-o", "LOG", "--model-from", "LOG", "--force"], "is the log with the model"),
-        ([*HEAD, "RIG", "-o", "a.mcap"], "has no calibration"),
-    ],
-)
-def test_incompatible_options_are_refused(
-    ipsys: Ipsys, still_lab: Lab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given: list[str], said: str
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    named = {"RIG": str(still_lab.rig), "LOG": str(still_lab.lenses)}
-    done = ipsys(*(named.get(one, one) for one in given), "--port", "0")
-    assert done.code == 1
-    assert said in done.err
-    assert list(tmp_path.iterdir()) == []
-
-
 def typed(command: list[str], answers: list[tuple[str, str]]) -> tuple[int, str]:
     """Run a command in a terminal, and answer its questions; return exit code and output."""
     child, terminal = pty.fork()

@@ -7,6 +7,7 @@ import json
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from ipsys_log.messages.channels import MARKERS
@@ -41,8 +42,16 @@ def test_all_models_are_studied_by_one_command(ipsys: Ipsys, data: Path, tmp_pat
     log, folder = tmp_path / "imsel.mcap", tmp_path / "figures"
     ipsys("import", "imsel", data / "imsel", "-o", log)
     done = ipsys("evaluate", log, "--plots", folder, "--json")
-    models = json.loads(done.out)["models"]
+    answer = json.loads(done.out)
+    models, advice = answer["models"], answer["recommendation"]["sentences"]
     assert len(models) == 11
+    assert advice[1].startswith("Model best with 10 points is as good as poly with 40")
+    assert advice[2].startswith("With known marker heights, model rayplane with 10 points")
+    # Training pair 11 of the white camera contradicts its neighbours by 8 to 14 cm.
+    for name in ("poly", "best"):
+        first = models[name]["suspects"][0]
+        assert first["measurement"] == "white_11"
+        assert 0.08 <= np.linalg.norm(first["residual_m"]) <= 0.14
     written = {path.name for path in folder.iterdir()}
     assert {"table_1.csv", "table_2.csv", "figure_9.png", "figure_10.png", "figure_11.png"} <= written
     with (data / "imsel" / "paper_tables.csv").open() as file:

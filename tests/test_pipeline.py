@@ -125,16 +125,6 @@ def test_stage_across_cameras_gets_messages_in_order() -> None:
     assert order == sorted(order)
 
 
-@pytest.mark.slow
-def test_a_replay_gives_the_same_bytes_every_time(lab_log: Path, tmp_path: Path) -> None:
-    written = []
-    for number in range(2):
-        log = Path(shutil.copy(lab_log, tmp_path / f"{number}.mcap"))
-        replay([log], Request(models=("poly",)))
-        written.append(log.read_bytes())
-    assert len(set(written)) == 1
-
-
 def test_failed_thread_raises_and_stops_the_others() -> None:
     def failing(message: Message) -> Iterator[Any]:
         if message.log_time_ns == 20:
@@ -167,15 +157,6 @@ def test_each_result_is_computed_once(ipsys: Ipsys, lab: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_second_model_shares_the_detection(ipsys: Ipsys, lab: Path) -> None:
-    ipsys("replay", lab)
-    stages = stages_of(ipsys, "replay", lab, "--model", "rigid+poly")
-    assert stages["detect"] == ("edges", False)
-    assert stages["fit"] == ("rigid_poly", True)
-    assert stages["fuse"] == ("rigid_poly", True)
-
-
-@pytest.mark.slow
 def test_replay_in_place_equals_replay_into_a_new_log(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
     beside, before = tmp_path / "derived.mcap", lab.read_bytes()
     assert ipsys("replay", lab, "-o", beside).code == 0
@@ -193,81 +174,78 @@ def test_replay_in_place_equals_replay_into_a_new_log(ipsys: Ipsys, lab: Path, t
 
 
 @pytest.mark.slow
-def test_corrected_marker_length_makes_a_new_run(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
-    ipsys("replay", lab)
-    rig = write_rig(tmp_path / "lab.toml", lab, 0.18)
-    stages = stages_of(ipsys, "replay", lab, "--rig", rig)
+def test_corrected_marker_length_makes_a_new_run(ipsys: Ipsys, replayed_lab: Path, tmp_path: Path) -> None:
+    rig = write_rig(tmp_path / "lab.toml", replayed_lab, 0.18)
+    stages = stages_of(ipsys, "replay", replayed_lab, "--rig", rig)
     # The length changes the camera points, not the corners.
     assert stages["detect"] == ("edges", False)
     assert stages["camera-frame"] == ("edges_2", True)
     assert stages["fit"] == ("poly_2", True)
-    with Session([lab]) as session:
+    with Session([replayed_lab]) as session:
         old, new = (
             [p.z_m for m in session.payloads(session.topics(CAMERA_POINTS, run)) for p in m.points]
             for run in ("edges", "edges_2")
         )
     np.testing.assert_allclose(np.array(new) / np.array(old), 0.9, rtol=1e-12)
     # Both runs exist, and each is found again.
-    assert all(not new for _, new in stages_of(ipsys, "replay", lab).values())
-    assert all(not new for _, new in stages_of(ipsys, "replay", lab, "--rig", rig).values())
+    assert all(not new for _, new in stages_of(ipsys, "replay", replayed_lab).values())
+    assert all(not new for _, new in stages_of(ipsys, "replay", replayed_lab, "--rig", rig).values())
 
 
-def test_equal_rig_changes_nothing(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
-    ipsys("replay", lab)
-    rig = write_rig(tmp_path / "lab.toml", lab, 0.20)
+def test_equal_rig_changes_nothing(ipsys: Ipsys, replayed_lab: Path, tmp_path: Path) -> None:
+    rig = write_rig(tmp_path / "lab.toml", replayed_lab, 0.20)
     assert load_rig(rig).name == "simulated"
-    assert all(not new for _, new in stages_of(ipsys, "replay", lab, "--rig", rig).values())
+    assert all(not new for _, new in stages_of(ipsys, "replay", replayed_lab, "--rig", rig).values())
 
 
-@pytest.mark.slow
-def test_a_lens_calibrated_later_is_a_new_run(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
-    ipsys("replay", lab)
-    with Session([lab]) as session:
+def write_lens(path: Path, log: Path, scale: float) -> Path:
+    """Write the calibration of the camera red with a scaled focal length."""
+    with Session([log]) as session:
         lens = session.payloads(["/cameras/red/calibration"])[0]
-    for scale, fresh in ((1.01, True), (1.0, False)):
-        path = tmp_path / f"red_{scale}.yaml"
-        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
-        storage.write("camera_matrix", lens.K * np.array([[scale, 1, 1], [1, scale, 1], [1, 1, 1]]))
-        storage.write("distortion_coefficients", lens.D.reshape(-1, 1))
-        storage.write("image_width", lens.width)
-        storage.write("image_height", lens.height)
-        storage.release()
-        stages = stages_of(ipsys, "replay", lab, "--calibration", f"red={path}")
-        # Edge fits need intrinsics.
-        assert (stages["detect"][1], stages["camera-frame"][1]) == (fresh, fresh)
-    runs = json.loads(ipsys("runs", lab, "--json").out)["rows"]
-    assert [run["overrides"] for run in runs if run["run"] == "edges_2"] == [["lens red"]] * 2
-
-
-def test_another_lens_is_tested_by_stock_corners_too(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
-    ipsys("replay", lab, "--corners", "stock")
-    with Session([lab]) as session:
-        lens = session.payloads(["/cameras/red/calibration"])[0]
-    path = tmp_path / "red.yaml"
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
-    storage.write("camera_matrix", lens.K * np.array([[1.01, 1, 1], [1, 1.01, 1], [1, 1, 1]]))
+    storage.write("camera_matrix", lens.K * np.array([[scale, 1, 1], [1, scale, 1], [1, 1, 1]]))
     storage.write("distortion_coefficients", lens.D.reshape(-1, 1))
     storage.write("image_width", lens.width)
     storage.write("image_height", lens.height)
     storage.release()
-    stages = stages_of(ipsys, "replay", lab, "--corners", "stock", "--calibration", f"red={path}")
+    return path
+
+
+@pytest.mark.slow
+def test_a_lens_calibrated_later_is_a_new_run(ipsys: Ipsys, detected_lab: Path, tmp_path: Path) -> None:
+    log = detected_lab
+    for scale, fresh in ((1.01, True), (1.0, False)):
+        lens = f"red={write_lens(tmp_path / 'red.yaml', log, scale)}"
+        stages = stages_of(ipsys, "camera-frame", log, "--calibration", lens)
+        # Edge fits need intrinsics.
+        assert (stages["detect"][1], stages["camera-frame"][1]) == (fresh, fresh)
+    runs = json.loads(ipsys("runs", log, "--json").out)["rows"]
+    assert [run["overrides"] for run in runs if run["run"] == "edges_2"] == [["lens red"]] * 2
+
+
+def test_another_lens_is_tested_by_stock_corners_too(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
+    stock = ("camera-frame", lab, "--corners", "stock")
+    assert ipsys(*stock).code == 0
+    lens = f"red={write_lens(tmp_path / 'red.yaml', lab, 1.01)}"
+    stages = stages_of(ipsys, *stock, "--calibration", lens)
     assert stages["detect"] == stages["camera-frame"] == ("stock_2", True)
 
 
-def test_a_model_of_another_log_is_applied_and_copied_in(ipsys: Ipsys, lab: Path, tmp_path: Path) -> None:
-    ipsys("replay", lab)
+def test_a_model_of_another_log_is_applied_and_copied_in(
+    ipsys: Ipsys, replayed_lab: Path, tmp_path: Path
+) -> None:
     drive = tmp_path / "drive.mcap"
-    with Session([lab]) as session:
+    with Session([replayed_lab]) as session:
         kept = ["/rig", *session.images.values(), *session.calibrations.values()]
         write_log(drive, session.messages(kept))
         original = session.payloads(session.topics(MODEL, "poly"))[0]
     done = ipsys("replay", drive)  # the log has no own measurements
     assert done.code == 1
     assert f"enter some with 'ipsys measure {drive}', or apply a model of another log" in done.err
-    stages = stages_of(ipsys, "replay", drive, "--model-from", lab)
+    stages = stages_of(ipsys, "replay", drive, "--model-from", replayed_lab)
     assert stages["fit"] == ("poly", True)
     assert "evaluate" not in stages
-    lab.unlink()  # the log needs no other file
+    replayed_lab.unlink()  # the log needs no other file
     with Session([drive]) as session:
         assert encode(session.payloads(session.topics(MODEL, "poly"))[0]) == encode(original)
         assert session.payloads(session.topics(TRACKS, "poly"))
@@ -327,11 +305,11 @@ def test_equal_point_names_of_two_logs_stay_different_points(tmp_path: Path) -> 
         assert [(one.id, one.marker_id) for one in places] == [("p001", 3), ("p002", 3), ("p002_2", 5)]
 
 
-def test_a_run_may_be_named(ipsys: Ipsys, lab: Path) -> None:
-    stages = stages_of(ipsys, "replay", lab, "--run", "monday")
-    assert stages["detect"] == ("edges", True)
+def test_a_run_may_be_named(ipsys: Ipsys, detected_lab: Path) -> None:
+    stages = stages_of(ipsys, "replay", detected_lab, "--run", "monday")
+    assert stages["detect"] == ("edges", False)
     assert stages["fit"] == stages["fuse"] == ("monday", True)
-    again = ipsys("replay", lab, "--run", "monday", "--model", "rigid")
+    again = ipsys("replay", detected_lab, "--run", "monday", "--model", "rigid")
     assert again.code == 1
     assert "monday already has the stage fit" in again.err
 

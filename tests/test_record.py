@@ -22,7 +22,7 @@ from ipsys_log.messages import CompressedImage, Message, image_topic
 from ipsys_log.messages.channels import EVENTS
 from ipsys_log.messages.rig_file import load_rig
 from tests.capture.streams import encode, make_jpegs, serve
-from tests.conftest import Ipsys, small_disk
+from tests.conftest import Ipsys
 from tests.ports import free_port
 from tests.tiers import first_fast
 from tests.waiting import wait_until
@@ -247,24 +247,6 @@ def test_second_interrupt_ends_a_hanging_command(what: str, ipsys: Ipsys, tmp_pa
     assert 80 < len(frames(log)["red"]) <= 200
 
 
-ENDING = """
-import signal, time
-from ipsys_log.app.cli import open_cameras
-from ipsys_log.capture.multiplexer import LiveCameras
-from ipsys_log.capture.frames import Clock
-
-attached = LiveCameras([], None, Clock())
-with open_cameras._stop_after(attached.stop, None):
-    signal.signal(signal.SIGALRM, lambda *_: attached.stop())
-    signal.setitimer(signal.ITIMER_REAL, 0.002, 0.002)
-    end = time.monotonic() + 2
-    while time.monotonic() < end:
-        with attached:  # its locks are taken and given back
-            assert list(attached) == []
-    signal.setitimer(signal.ITIMER_REAL, 0)
-"""
-
-
 def test_interrupt_does_not_wait_for_the_rendering(tmp_path: Path) -> None:
     rig = tmp_path / "lab.toml"
     rig.write_text(
@@ -285,31 +267,6 @@ def test_interrupt_does_not_wait_for_the_rendering(tmp_path: Path) -> None:
     # The preparation of the view alone takes longer.
     assert resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - before_s < 8
     assert not (tmp_path / "a.mcap").exists()
-
-
-def test_a_signal_may_come_at_any_moment() -> None:
-    subprocess.run([sys.executable, "-c", ENDING], timeout=LIMIT_S, check=True)
-
-
-@pytest.mark.slow
-def test_log_of_a_recorder_that_is_killed_is_repaired(
-    ipsys: Ipsys, pictures: tuple[Path, list[bytes]], tmp_path: Path
-) -> None:
-    """At most one second is lost: tests/capture/test_recorder.py has the exact test."""
-    log = tmp_path / "a.mcap"
-    with streams(pictures[0], tmp_path) as rig:
-        program = started("record", "--rig", rig, "-o", log)
-        wait_for(log, 1_000_000)
-        program.kill()
-        program.communicate(timeout=LIMIT_S)
-    done = ipsys("info", log)
-    assert done.code == 1
-    assert f"Run: ipsys repair {log}" in done.err
-    assert ipsys("repair", log).code == 0
-    with Session([log]) as session:
-        counts = {name: session.count(topic) for name, topic in session.images.items()}
-    assert counts.keys() == set(NAMES)
-    assert all(counts.values())
 
 
 @pytest.mark.slow
@@ -401,19 +358,6 @@ def test_renamed_log_is_recorded_to_its_end(pictures: tuple[Path, list[bytes]], 
     assert sorted(frames(new)) == sorted(NAMES)
 
 
-@pytest.mark.slow
-def test_a_full_disk_ends_it_with_a_complete_log(
-    ipsys: Ipsys, pictures: tuple[Path, list[bytes]], tmp_path: Path
-) -> None:
-    with small_disk(tmp_path / "disk", 20) as disk:
-        with streams(pictures[0], tmp_path) as rig:
-            done = ipsys("record", "--rig", rig, "-o", disk / "a.mcap", "--seconds", "60")
-        found = frames(disk / "a.mcap")
-    assert done.code == 1
-    assert "the disk is full; the recording has stopped. The log is complete" in done.err
-    assert all(len(jpegs) > 5 for jpegs in found.values())
-
-
 def test_existing_file_is_overwritten_only_with_the_option(
     ipsys: Ipsys, pictures: tuple[Path, list[bytes]], tmp_path: Path
 ) -> None:
@@ -433,18 +377,6 @@ def test_existing_file_is_overwritten_only_with_the_option(
     [
         ('name = "red"', "no camera has a source"),
         ('name = "red"\nsource = "carrier_pigeon:7"', "'carrier_pigeon:7' has an unknown type; use one of"),
-        ('name = "red"\nsource = "http://127.0.0.1:9/x"', "http://127.0.0.1:9/x"),
-        (
-            'name = "red"\nsource = "a:1"\n[[cameras]]\nname = "white"\nsource = "a:1"',
-            "two cameras have the source 'a:1'",
-        ),
-        (
-            'name = "red"\nsource = "usb:7"\n[[cameras]]\nname = "white"\nsource = "usb:/dev/video7"',
-            "cameras red and white have the same device, /dev/video7",
-        ),
-        ('name = "red"\nstamp = "middle"', 'stamp is \'middle\'; write "start" or "end"'),
-        ('name = "red"\nsourc = "a"', "unknown key 'sourc'"),
-        ('name = "red"\nrate_hz = 0', "rate_hz is 0.0; it must be above 0"),
     ],
 )
 def test_a_rig_that_cannot_be_recorded(ipsys: Ipsys, tmp_path: Path, cameras: str, said: str) -> None:

@@ -44,26 +44,6 @@ def refused(ipsys: Ipsys, log: Path, *arguments: object) -> str:
     return done.err
 
 
-def test_one_pair_entered_twice(ipsys: Ipsys, tmp_path: Path) -> None:
-    def twice(points: np.ndarray, tape: np.ndarray) -> None:
-        points[7], tape[7] = points[3], tape[3]
-
-    log = made(tmp_path / "lab.mcap", spoil=twice)
-    said = refused(ipsys, log, "evaluate", "--model", "poly")
-    assert "m03 and m07 are the same pair" in said
-
-
-def test_collinear_too_few_or_missing_points_are_refused(ipsys: Ipsys, tmp_path: Path) -> None:
-    def on_a_line(points: np.ndarray, tape: np.ndarray) -> None:
-        tape[:, 1] = 0.5 * tape[:, 0]
-        tape[:, 2] = 0.0
-
-    log = made(tmp_path / "line.mcap", spoil=on_a_line)
-    assert "are on one line" in refused(ipsys, log, "fit", "--model", "best")
-    few = made(tmp_path / "few.mcap", count=4)
-    assert "best needs at least 5" in refused(ipsys, few, "evaluate", "--model", "best")
-
-
 def test_nan_in_an_import_is_refused_and_nothing_is_written(ipsys: Ipsys, data: Path, tmp_path: Path) -> None:
     folder = tmp_path / "imsel"
     folder.mkdir()
@@ -186,15 +166,3 @@ def test_imported_run_is_not_repeatable_and_later_ones_are(ipsys: Ipsys, data: P
     assert (verified.code, verified.err) == (0, "")
     assert "rigid/tracks" in verified.out
     assert "imsel" not in verified.out
-
-
-# The published data with two models.
-@pytest.mark.slow
-def test_wrong_point_of_the_authors_ranks_first(ipsys: Ipsys, data: Path, tmp_path: Path) -> None:
-    """Training pair 11 of the white camera contradicts its neighbours by 8 to 14 cm."""
-    log = tmp_path / "imsel.mcap"
-    ipsys("import", "imsel", data / "imsel", "-o", log)
-    done = ipsys("evaluate", log, "--model", "poly", "--model", "best", "--json")
-    for found in json.loads(done.out)["models"].values():
-        assert found["suspects"][0]["measurement"] == "white_11"
-        assert 0.08 <= np.linalg.norm(found["suspects"][0]["residual_m"]) <= 0.14

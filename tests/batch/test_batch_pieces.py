@@ -13,9 +13,8 @@ from typing import Any
 import pytest
 
 from ipsys_log.api import python_api as api
-from ipsys_log.api.batch.execution import MOST_ENDED_WORKERS
 from tests.batch.piece_works import NOTES, PARAMETERS, UNTIL
-from tests.batch.works import DEADLY, HELD, PATIENCE_S, one_worker_killed
+from tests.batch.works import HELD, PATIENCE_S, one_worker_killed
 from tests.conftest import ROOT
 
 pytestmark = pytest.mark.slow
@@ -81,11 +80,3 @@ def test_killed_worker_costs_only_its_piece(lab_log: Path, tmp_path: Path, repla
     assert results[HELD]["state"] == "computed", results
     assert {key for key, count in counts.items() if count > 1} == {(notes / "killed").read_text()}
     assert log.read_bytes() == replayed
-
-
-def test_piece_that_ends_all_its_workers_is_named(lab_log: Path, tmp_path: Path) -> None:
-    log = Path(shutil.copy(lab_log, tmp_path / DEADLY))
-    notes = tmp_path / "notes"
-    failed = drive([log], notes, workers=2)[DEADLY]
-    assert f"its worker ended {MOST_ENDED_WORKERS} times in the piece of " in failed["text"]
-    assert log.read_bytes() == lab_log.read_bytes()

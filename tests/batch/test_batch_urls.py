@@ -47,16 +47,11 @@ def test_results_of_objects_are_in_derived_logs(bucket: Any, tmp_path: Path) -> 
     derived = [tmp_path / "out" / f"2026-{month}" / "lab.derived.mcap" for month in ("01", "02")]
     assert sorted(path for path in (tmp_path / "out").rglob("*") if path.is_file()) == derived
     assert [log.read_bytes() == (tmp_path / "alone.mcap").read_bytes() for log in derived] == [True, True]
-    others = (("verify", "identical"), ("check", "sound"), ("evaluate", "up to date"))
-    for name, state in others:
-        options = ("--model", "rigid") if name == "evaluate" else ()
-        _, result, errors = batch(tmp_path, name, command[1], *options, "-o", "out", "--workers", 1)
-        assert result["states"] == {state: 2}, errors
-        assert [row["derived"] for row in result["results"]] == [*map(str, derived)]
-    assert [log.read_bytes() == (tmp_path / "alone.mcap").read_bytes() for log in derived] == [True, True]
     put(bucket, "2026-03/lab.mcap", b"no log")
     _, result, errors = batch(tmp_path, *command)
     assert result["states"] == {"up to date": 2, "failed": 1}, errors
+    assert [row["derived"] for row in result["results"]][:2] == [*map(str, derived)]
+    assert [log.read_bytes() == (tmp_path / "alone.mcap").read_bytes() for log in derived] == [True, True]
     assert result["results"][2]["log"] == "s3://logs/2026-03/lab.mcap"
     assert len(result["results"][2]["text"].splitlines()) == 1
 

@@ -18,11 +18,10 @@ from typing import Any, NamedTuple
 import pytest
 
 from ipsys_log.api import python_api as api
-from ipsys_log.api.batch.execution import MOST_ENDED_WORKERS
 from ipsys_log.api.batch.log_work import replay_log
 from ipsys_log.exchange.row_files import read_rows
 from ipsys_log.tools.soundness.finding import BROKEN
-from tests.batch.works import DEADLY, HELD, PATIENCE_S, batch, one_worker_killed, read_json, wait_for
+from tests.batch.works import HELD, PATIENCE_S, batch, one_worker_killed, read_json, wait_for
 from tests.conftest import ROOT, small_disk
 
 pytestmark = pytest.mark.slow
@@ -64,12 +63,11 @@ def drive(logs: list[Path], notes: Path, **workers: object) -> dict[str, Any]:
     return {Path(result["log"]).name: result for result in answer["results"]}
 
 
-@pytest.mark.parametrize("workers", [1, 2])
-def test_logs_have_the_bytes_of_the_single_command(tmp_path: Path, replayed: bytes, workers: int) -> None:
+def test_logs_have_the_bytes_of_the_single_command(tmp_path: Path, replayed: bytes) -> None:
     logs = copies(tmp_path / "logs", *(f"{number}.mcap" for number in range(4)))
     broken = tmp_path / "logs" / "broken.mcap"
     broken.write_bytes(PAPER_LAB.read_bytes()[:100_000])
-    command = ("replay", "logs", "--model", "rigid", "--workers", workers, "--table", "results.parquet")
+    command = ("replay", "logs", "--model", "rigid", "--workers", 2, "--table", "results.parquet")
     code, result, errors = batch(tmp_path, *command)
     assert code == 1
     assert "dashboard: http://127.0.0.1:" in errors
@@ -96,19 +94,6 @@ def test_killed_worker_costs_no_log(tmp_path: Path, replayed: bytes) -> None:
         results = drive(logs, tmp_path / "notes", workers=2)
     assert [name for name, result in results.items() if not result["good"]] == []
     assert [log.name for log in logs if log.read_bytes() != replayed] == []
-
-
-def test_log_that_ends_all_its_workers_is_named(tmp_path: Path, replayed: bytes) -> None:
-    logs = copies(tmp_path / "logs", "0.mcap", DEADLY, "1.mcap", "2.mcap")
-    notes = tmp_path / "notes"
-    results = drive(logs, notes, workers=2)
-    assert {name for name, result in results.items() if not result["good"]} == {DEADLY}
-    assert f"its worker ended {MOST_ENDED_WORKERS} times" in results[DEADLY]["text"]
-    # A worker can end while a log waits for it.
-    assert 1 <= len((notes / "deadly.starts").read_text()) <= MOST_ENDED_WORKERS
-    for log in logs:
-        expected = PAPER_LAB.read_bytes() if log.name == DEADLY else replayed
-        assert log.read_bytes() == expected, log.name
 
 
 def test_interrupt_ends_all_workers_and_keeps_whole_logs(tmp_path: Path) -> None:

@@ -107,31 +107,6 @@ def test_log_times_are_utc() -> None:
     assert before_ns - 50_000_000 < first.log_time_ns < time.time_ns() + 50_000_000
 
 
-def test_a_camera_without_stamps_has_the_time_of_arrival() -> None:
-    """The time is the arrival in the thread, even if the frame waited. There is no delay to report."""
-    sent_ns: list[int] = []
-    clock = Clock()
-
-    def before(_: str, number: int) -> None:
-        if number == 1:  # before this, frames without stamps are discarded
-            assert attached._started.wait(LIMIT_S)
-        sent_ns.append(clock.now_ns())
-
-    attached = LiveCameras(cameras("red"), playing(FRAMES, 200.0, False, before), clock)
-    with attached:
-        wait_until(lambda: attached.states["red"].frames == 20, "red has sent 20 frames")
-        taken_ns = clock.now_ns()
-        frames = [message for message in attached if message is not None and message.camera == "red"]
-    assert len(frames) == 20
-    assert all(message.publish_time_ns < taken_ns < message.log_time_ns for message in frames)
-    assert all(
-        attached.received_ns[m.log_time_ns] == m.publish_time_ns == m.payload.timestamp for m in frames
-    )
-    for (sent, following), message in zip(pairwise([*sent_ns, taken_ns]), frames, strict=True):
-        assert sent <= message.publish_time_ns <= following
-    assert attached.states["red"].delay_s is None
-
-
 def test_frames_lost_before_arrival_are_counted_and_named() -> None:
     @contextmanager
     def opened(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Frame | None]]:
@@ -329,27 +304,6 @@ def test_no_frame_is_accepted_without_a_writer() -> None:
     assert [message.payload.text for message in found if message.topic == "/note"] == ["written"]
 
 
-def test_saved_point_is_on_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(attached_module, "_SAVED_S", LIMIT_S)
-    asked: list[str] = []
-    with silent_camera() as attached, ThreadPoolExecutor(1) as page:
-        saved = page.submit(lambda: attached.save("/note", Event(5, "note", "kept")))
-        for message in attached:
-            if message is not None and message.topic == "/note":
-                time.sleep(0.3)
-                assert not saved.done()
-                asked.append("written")
-                note = message
-            elif len(asked) == 1:
-                assert not saved.done(), "written, but not on the disk yet"
-                asked.append("on the disk")
-                attached.confirm(note)
-            elif asked:
-                saved.result(LIMIT_S)
-                break
-        assert asked
-
-
 def test_failed_write_is_not_saved_and_gives_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(attached_module, "_SAVED_S", LIMIT_S)
     with silent_camera() as attached, ThreadPoolExecutor(1) as page:
@@ -373,39 +327,6 @@ def test_timed_out_save_is_not_written_later(monkeypatch: pytest.MonkeyPatch) ->
         with pytest.raises(SourceError, match="not saved: the disk is too slow"):
             attached.save("/note", Event(5, "note", "late"))
         assert not [one for one in attached if one is not None and one.topic == "/note"]
-
-
-def test_frames_dropped_at_the_end_are_reported() -> None:
-    frames = {"red": [bytes(1000)] * 40}
-    attached = LiveCameras(cameras("red"), playing(frames, 500.0), Clock(), limit_bytes=10_000)
-    with attached:
-        wait_until(lambda: attached.states["red"].dropped > 0, "a frame is dropped")
-        attached.stop()
-        found = [message for message in attached if message is not None]
-    (event,) = events(found)
-    assert (
-        event.text == f"{attached.states['red'].dropped} frames of camera red dropped: the disk is too slow"
-    )
-
-
-def test_early_frames_do_not_pile_up_while_another_camera_opens() -> None:
-    @contextmanager
-    def opened(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Frame | None]]:
-        def sent() -> Iterator[Frame | None]:
-            if camera.name == "late":
-                wait_until(lambda: attached.states["early"].frames > 0, "the early camera sends")
-                time.sleep(0.3)
-                waiting.append(attached.states["early"].frames)
-            for n in range(5):
-                yield Frame(b"%d" % n, "jpeg", clock.now_ns())
-
-        yield sent()
-
-    waiting: list[int] = []
-    attached = LiveCameras(cameras("early", "late"), opened, Clock())
-    with attached:
-        assert waiting == [1]
-        assert len([message for message in attached if message is not None]) == 10
 
 
 @pytest.mark.parametrize("format", ["jpeg", "h264"])
@@ -492,15 +413,6 @@ def test_stop_delivers_received_frames() -> None:
                 attached.stop()
                 stopped.set()
     assert 5 <= len(found) < 20
-
-
-def test_a_bug_in_a_source_keeps_its_traceback() -> None:
-    def broken(camera: str, number: int) -> None:
-        if number == 3:
-            raise ZeroDivisionError("a bug")
-
-    with pytest.raises(ZeroDivisionError, match="a bug"):
-        messages(LiveCameras(cameras("red"), playing(FRAMES, 100.0, before=broken), Clock()))
 
 
 def test_silent_camera_does_not_stop_the_others() -> None:

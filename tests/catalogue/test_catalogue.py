@@ -10,15 +10,15 @@ from pathlib import Path
 from typing import Any
 
 import fsspec
-import numpy as np
 import pandas as pd
 import pytest
 
 from ipsys_log.api import python_api as api
-from ipsys_log.api.catalogue import update_catalogue
+from ipsys_log.api.catalogue import Baseline, update_catalogue
+from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.engine import output
 from ipsys_log.engine.graph import VERSIONS
-from ipsys_log.engine.output import append_messages
+from ipsys_log.engine.output import append_messages, write_log
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.row_files import Columns, read_rows, write_rows
 from ipsys_log.log.dataset import Session
@@ -26,6 +26,9 @@ from ipsys_log.log.location import LogUrl
 from ipsys_log.messages import Event, Message
 from ipsys_log.messages.channels import EVALUATION, EVENTS_TOPIC
 from tests.conftest import ROOT, Ipsys
+from tests.geometric.lab import GeometricSettings, build_lab
+from tests.geometric.session import simulate_session
+from tests.geometric.weeks import Knock, WeekSettings, simulate_week
 
 GOLDEN = ROOT / "tests" / "golden" / "v0_1_0.mcap"
 SMALL_LAB = ROOT / "sample_logs" / "small_lab.mcap"
@@ -128,43 +131,6 @@ def test_only_new_and_changed_logs_are_read(folder: Path, tmp_path: Path) -> Non
     # An update gives the same rows as a new catalogue.
     update_catalogue(folder, tmp_path / "again.parquet")
     assert target.read_bytes() == (tmp_path / "again.parquet").read_bytes()
-
-
-@pytest.mark.slow
-def test_newer_stages_change_the_states_in_a_catalogue(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def outdated() -> tuple[list[str], str]:
-        row = rows_of(tmp_path / "catalogue.parquet")["2026/golden.mcap"]
-        return list(row["outdated_runs"]), ", ".join(one["state"] for one in row["runs"])
-
-    update_catalogue(folder, tmp_path / "catalogue.parquet")
-    # The golden log is of an earlier version.
-    assert outdated()[0] == ["best", "edges", "poly", "rigid"]
-    assert "this is rigid 99" not in outdated()[1]
-    monkeypatch.setitem(VERSIONS, "rigid", 99)
-    assert update_catalogue(folder, tmp_path / "catalogue.parquet").read == 3
-    assert "this is rigid 99" in outdated()[1]
-
-
-@pytest.mark.slow
-def test_duckdb_and_pandas_answer_the_same_question(folder: Path, tmp_path: Path) -> None:
-    """Compare the errors of models over all logs, as the page about the catalogue does."""
-    import duckdb  # late: it complains at the end about objects that the garbage collection has exempted
-
-    target = tmp_path / "catalogue.parquet"
-    update_catalogue(folder, target)
-    ask: Any = duckdb.sql
-    found = ask(
-        "SELECT e.model, avg(e.mean_m) FROM (SELECT unnest(evaluations) AS e FROM read_parquet("
-        f"'{target}')) WHERE e.dimensions = '2d' AND e.scheme = 'held_out' GROUP BY e.model ORDER BY e.model"
-    ).fetchall()
-    table = pd.read_parquet(target).explode("evaluations").dropna(subset="evaluations")
-    rows = pd.DataFrame(table["evaluations"].tolist())
-    wanted = rows[(rows.dimensions == "2d") & (rows.scheme == "held_out")].groupby("model").mean_m.mean()
-    assert [name for name, _ in found] == [*wanted.index]
-    assert len(found) >= 2
-    np.testing.assert_allclose([mean for _, mean in found], wanted)
 
 
 def test_questions_of_the_documentation_have_answers(
@@ -298,3 +264,32 @@ def test_outdated_runs_are_replayed_once(tmp_path: Path, monkeypatch: pytest.Mon
     assert "run rigid is out of date" in result.text
     # The old run is superseded: nothing is left to do.
     assert replay_log(log, **options).state == "not outdated"
+
+
+WEEKS = WeekSettings(duration_s=3.0, knocks=(Knock("white", 3, (0.0010, 0.0020, 0.0003)),))
+
+
+def settings(drive_s: float) -> GeometricSettings:
+    return GeometricSettings(lab=LabSettings(seed=3, rate_hz=10.0, drive_s=drive_s, markers=2), points=30)
+
+
+@pytest.mark.slow
+def test_camera_that_was_knocked_has_moved_in_later_logs(tmp_path: Path) -> None:
+    model, folder = tmp_path / "model.mcap", tmp_path / "weeks"
+    write_log(model, simulate_session(build_lab(settings(5.0))))
+    api.replay(model, models=("best",), until="fit")
+    folder.mkdir()
+    for week in (1, 2, 3, 4):
+        write_log(folder / f"week{week}.mcap", simulate_week(build_lab(settings(0.0)), WEEKS, week))
+    target, baseline = tmp_path / "catalogue.parquet", Baseline(folder / "week1.mcap", model)
+    assert update_catalogue(folder, target, baseline).read == 4
+    rows = pd.read_parquet(target).set_index("log")
+    for week in (1, 2, 3, 4):
+        row: Any = rows.loc[f"week{week}.mcap"]
+        assert pd.isna(row["drift_error"])
+        moved = {camera["camera"] for camera in row["drift"] if camera["moved"]}
+        assert moved == ({"white"} if week >= 3 else set())
+    assert update_catalogue(folder, target, baseline).read == 0
+    # Without its baseline, a catalogue has no drift.
+    assert update_catalogue(folder, target).read == 4
+    assert pd.read_parquet(target)["drift"].isna().all()

@@ -172,22 +172,6 @@ def test_a_video(ipsys: Ipsys, rendered: Path, tmp_path: Path) -> None:
     assert found["parameters"]["fx"] == pytest.approx(LENS[0], abs=5 * found["standard_deviations"]["fx"])
 
 
-@pytest.mark.parametrize(
-    ("board", "said"),
-    [
-        ("7x5", "a chessboard of 6 x 4 inner corners is in"),
-        (
-            "charuco:7x5",
-            "but a chessboard of 6 x 4 inner corners is in 3 of 3 checked pictures: give --board 6x4",
-        ),
-    ],
-)
-def test_wrong_board_size_is_reported(ipsys: Ipsys, red: Path, tmp_path: Path, board: str, said: str) -> None:
-    for path in list(red.iterdir())[3:]:
-        path.unlink()
-    assert said in refused(ipsys, tmp_path, red, "--board", board, "-o", tmp_path)
-
-
 def test_too_few_pictures(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:
     for path in list(red.iterdir())[4:]:
         path.unlink()
@@ -249,39 +233,11 @@ def test_bad_camera_does_not_cost_the_others(ipsys: Ipsys, red: Path, tmp_path: 
     assert green["files"] == []
 
 
-def test_every_bad_camera_is_named(ipsys: Ipsys, tmp_path: Path) -> None:
-    for name in ("blue", "green"):
-        (tmp_path / "all" / name).mkdir(parents=True)
-        cv2.imwrite(str(tmp_path / "all" / name / "1.png"), np.full((60, 80), 90, np.uint8))
-    done = calibrate(ipsys, tmp_path / "all", "--board", "6x4", "-o", tmp_path / "out")
-    assert done.code == 1
-    assert [line.split(":")[0] for line in done.err.splitlines()] == ["no file for blue", "no file for green"]
-    assert not (tmp_path / "out").exists()
-
-
-def test_pictures_without_the_board_are_named(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:
-    cv2.imwrite(str(red / "98.png"), np.full(SIZE_PX[::-1], 90, np.uint8))
-    done = calibrate(ipsys, red, "--board", "6x4", "-o", tmp_path)
-    assert done.code == 0, done.err
-    assert "board not found: 98.png: the board is not found" in done.out
-
-
 def test_better_model_is_named(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:
     done = calibrate(ipsys, red, "--board", "6x4", "--lens", "pinhole", "-o", tmp_path)
     assert re.search(
         r"error is 0\.\d+ px; with --lens (fisheye|pinhole8) it is 0\.0\d px: use this lens model", done.err
     )
-
-
-# All photographs of a real set; tests/calibration has the refusal on rendered corners.
-@pytest.mark.slow
-def test_pinhole_on_real_fisheye_is_refused(ipsys: Ipsys, data: Path, tmp_path: Path) -> None:
-    folder = data / "fisheye_chessboard"
-    done = ipsys("calibrate", folder, "--board", "6x4", "--lens", "pinhole", "-o", tmp_path)
-    assert done.code == 1
-    assert "the RMS reprojection error is 3.5 px" in done.err
-    assert "use --lens fisheye, with an error of 0.21 px; or use --force" in done.err
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_four_pictures_are_used_if_insisted_on(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:
@@ -290,21 +246,6 @@ def test_four_pictures_are_used_if_insisted_on(ipsys: Ipsys, red: Path, tmp_path
     done = calibrate(ipsys, red, "--board", "6x4", "-o", tmp_path, "--force")
     assert done.code == 0, done.err
     assert "written only because of --force: only 4 of 4 pictures can be used" in done.err
-
-
-def test_invalid_sources_are_refused(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:
-    board = ("--board", "6x4", "-o", tmp_path)
-    assert "nowhere: does not exist" in refused(ipsys, tmp_path, tmp_path / "nowhere", *board)
-    (tmp_path / "empty").mkdir()
-    assert "has no pictures" in refused(ipsys, tmp_path, tmp_path / "empty", *board)
-    (tmp_path / "a.txt").write_text("a")
-    assert "is not a log" in refused(ipsys, tmp_path, tmp_path / "a.txt", *board)
-    (tmp_path / "a.mp4").write_bytes(b"no video at all")
-    assert "cannot be read as a video" in refused(ipsys, tmp_path, tmp_path / "a.mp4", *board)
-    assert "--lens round: is not known" in refused(ipsys, tmp_path, red, *board, "--lens", "round")
-    assert "four coefficients" in refused(
-        ipsys, tmp_path, red, *board, "--lens", "pinhole", "--format", "kalibr"
-    )
 
 
 # All photographs of a real set; rendered corners are in tests/calibration.
@@ -324,14 +265,13 @@ def test_photographs_through_a_lens_of_more_than_180_degrees(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("camera", [0, 2])
-def test_videos_of_a_charuco_board(ipsys: Ipsys, data: Path, tmp_path: Path, camera: int) -> None:
+def test_video_of_a_charuco_board(ipsys: Ipsys, data: Path, tmp_path: Path) -> None:
     """Focal lengths are within 2 % of the reference, and within three of their standard deviations."""
     folder = data / "charuco_videos"
-    reference = (folder / "camera_array.toml").read_text().split(f"[cameras.{camera}]")[1]
+    reference = (folder / "camera_array.toml").read_text().split("[cameras.0]")[1]
     matrix = json.loads(re.findall(r"matrix = (\[\[.*?\]\])", reference)[0])
     board = ("--board", "charuco:4x5", "--dictionary", "DICT_4X4_1000", "--inverted", "--lens", "pinhole")
-    done = ipsys("calibrate", folder / f"cam_{camera}.mp4", *board, "-o", tmp_path, "--json")
+    done = ipsys("calibrate", folder / "cam_0.mp4", *board, "-o", tmp_path, "--json")
     assert done.code == 0, done.err
     [found] = json.loads(done.out)["rows"]
     for name, expected in (("fx", matrix[0][0]), ("fy", matrix[1][1])):

@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 import pytest
 
-from ipsys_log.calibration.joint.hypotheses import fit_hypotheses
 from ipsys_log.calibration.joint.locate import locate_markers
 from ipsys_log.calibration.joint.payload import restore_joint
 from ipsys_log.capture.simulation.settings import FLOOR_M, LabSettings
@@ -219,24 +218,6 @@ def test_plan_for_joint_proposes_a_drive_only_if_it_helps(
     assert "or drive a robot for 30 s, in curves, through x " in text
     high = ipsys("plan", fitted, "--model", "joint", "--places", "1", "--height-m", "0.3", "--json")
     assert json.loads(high.out)["places"][0]["height_m"] == 0.3
-
-
-def test_the_fit_of_calibrate_lab_runs_once(
-    ipsys: Ipsys, session_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    fits = []
-
-    def count(*arguments: Any, **options: Any) -> Any:
-        fits.append(1)
-        return fit_hypotheses(*arguments, **options)
-
-    monkeypatch.setattr("ipsys_log.statistics.joint_evaluation.fit_hypotheses", count)
-    monkeypatch.setattr("ipsys_log.statistics.joint_evaluation._LAST_FIT", [])
-    log = Path(shutil.copy(session_log, tmp_path / "lab.mcap"))
-    assert ipsys("calibrate-lab", log, "--goal-mm", "20").code == 0
-    assert len(fits) == 1
-    assert ipsys("calibrate-lab", log, "--goal-mm", "10").code == 0
-    assert len(fits) == 1
 
 
 def test_the_model_is_the_usual_run(ipsys: Ipsys, session_log: Path, tmp_path: Path) -> None:

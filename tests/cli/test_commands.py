@@ -182,31 +182,6 @@ def test_a_log_without_messages_has_no_date(ipsys: Ipsys, tmp_path: Path) -> Non
     assert json.loads(ipsys("info", tmp_path / "none.mcap", "--json").out)["start"] is None
 
 
-def test_info_fits_80_columns(ipsys: Ipsys, replayed_lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("COLUMNS", "80")
-    monkeypatch.chdir(replayed_lab.parent)
-    for command in ("info", "runs"):
-        done = ipsys(command, replayed_lab.name)
-        assert max(len(line) for line in done.out.splitlines()) <= 80, done.out
-
-
-def test_evaluate_fits_80_columns(ipsys: Ipsys, detected_lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Print the ground truth of a simulated lab in the terminal too."""
-    monkeypatch.setenv("COLUMNS", "80")
-    models = ("--model", "rigid", "--model", "poly", "--model", "rigid+poly")
-    done = ipsys("evaluate", detected_lab, *models, "--details")
-    assert done.code == 0, done.err
-    assert max(len(line) for line in done.out.splitlines()) <= 80, done.out
-    for title in (
-        "Best model: ",
-        "Against the ground truth: ",
-        "Errors in cm, held-out points",
-        "Errors in cm, cross-validated",
-        "Model by the number of points per camera",
-    ):
-        assert title in done.out
-
-
 CAMERAS = ("red", "white", "black")
 
 

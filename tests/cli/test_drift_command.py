@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from ipsys_log.api import python_api as api
 from ipsys_log.calibration.joint.locate import locate_markers
 from ipsys_log.calibration.joint.payload import restore_joint
 from ipsys_log.capture.simulation.settings import LabSettings
@@ -63,31 +64,9 @@ def weeks(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 
 @pytest.fixture(scope="module")
-def fitted(ipsys_module: Ipsys, calibration: Path) -> Path:
-    for model in ("joint", "best"):
-        done = ipsys_module("fit", calibration, "--model", model)
-        assert done.code == 0, done.err
+def fitted(calibration: Path) -> Path:
+    api.replay(calibration, models=["joint", "best"], until="fit")
     return calibration
-
-
-@pytest.fixture(scope="module")
-def ipsys_module() -> Ipsys:
-    """Return the command line for fixtures of the module, in a process of its own."""
-    import subprocess
-    import sys
-
-    from tests.conftest import Done
-
-    def run(*arguments: object) -> Done:
-        done = subprocess.run(
-            [sys.executable, "-m", "ipsys_log", *map(str, arguments)],
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        return Done(done.returncode, done.stdout, done.stderr)
-
-    return run
 
 
 def drift(ipsys: Ipsys, *arguments: object) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 from pathlib import Path
 
 import pytest
@@ -77,18 +76,6 @@ def test_log_without_model_is_refused(lab_log: Path, ipsys: Ipsys, tmp_path: Pat
     assert done.err.startswith(f"ipsys: {lab_log}: ")
     assert "model" in done.err
     assert done.err.count("\n") == 1
-
-
-def test_port_in_use_is_refused(replayed_log: Path, ipsys: Ipsys, tmp_path: Path) -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
-        taken.bind(("127.0.0.1", 0))
-        port = taken.getsockname()[1]
-        options = ("--model-from", replayed_log, "-o", tmp_path / "run.mcap", "--port", port)
-        done = ipsys("drive", *options, "--program", PROGRAM)
-    expected = (
-        f"ipsys: --port {port}: port {port} is in use, perhaps by another run; end it, or give another port\n"
-    )
-    assert (done.code, done.err) == (1, expected)
 
 
 def test_program_that_ends_is_named(replayed_log: Path, ipsys: Ipsys, tmp_path: Path) -> None:

@@ -108,7 +108,7 @@ def test_a_report_of_hostile_names_is_written(ipsys: Ipsys, lab: Path, tmp_path:
         topics = [topic for reader in session.readers for topic in reader.channels]
         write_log(path, map(rename, list(session.messages(topics))))
     page = tmp_path / "report.html"
-    done = ipsys("report", path, "--html", page)
+    done = ipsys("report", path, "--model", "rigid", "--html", page)
     assert done.code == 0, done.err
     text = page.read_text(encoding="utf-8")
     assert "lab\\udcff\\x1b[31m.mcap" in text

@@ -206,14 +206,6 @@ def test_impossible_plan_is_refused(ipsys: Ipsys, paper: Path) -> None:
     assert "no camera sees a whole marker 3.5 m above the floor" in refused(ipsys, paper, "--height-m", "3.5")
 
 
-def test_too_few_points_are_reported(ipsys: Ipsys, paper: Path) -> None:
-    def few(message: Message) -> Message | None:
-        payload = message.payload
-        return None if isinstance(payload, Measurement) and payload.id > "s003" else message
-
-    assert "best needs at least 5 calibration points" in refused(ipsys, rewrite(paper, few))
-
-
 def test_missing_data_of_the_log_give_notes(ipsys: Ipsys, authors: Path) -> None:
     """The log has no intrinsics, no floor, no reference points, and a camera without points."""
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import compileall
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -17,7 +16,7 @@ import pytest
 from ipsys_log.app.cli.signals import InterruptError, interruptible, writes_nothing
 from ipsys_log.log.atomic_files import replacement_of
 from ipsys_log.log.reader import LogReader
-from tests.conftest import ROOT, SIGNALS, Ipsys
+from tests.conftest import ROOT, SIGNALS
 from tests.test_record import wait_for
 
 SAMPLE = ROOT / "sample_logs" / "small_lab.mcap"
@@ -110,22 +109,6 @@ def test_record_stopped_anywhere_exits_with_0(tmp_path: Path) -> None:
         assert (code, "Traceback" in err) == (0, False), (part, err)
         if log.exists():
             LogReader(log).close()  # a complete log
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_measure_stopped_anywhere_exits_with_0(
-    number: int, lab_log: Path, ipsys: Ipsys, tmp_path: Path
-) -> None:
-    log = tmp_path / "lab.mcap"
-    shutil.copy(lab_log, log)
-    assert ipsys("camera-frame", log).code == 0
-    events = count_events("measure", log, "--places")
-    for part in (i / 8 for i in range(9)):
-        code, err = end(max(int(part * events), 1), number, "measure", log, "--port", "0")
-        assert (code, "Traceback" in err) == (0, False), (part, err)
-    code, err = end(events // 2, number, "measure", log, "--places")
-    assert code == 128 + number, err
 
 
 def start(*command: object, shell: str = "") -> subprocess.Popen[str]:

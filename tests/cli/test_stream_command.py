@@ -204,13 +204,6 @@ def test_streams_of_a_rig_file_are_opened_and_those_of_a_log_are_not(
     assert load_rig(tmp_path / "new.toml").stream is None
 
 
-def test_second_server_names_the_port(ipsys: Ipsys, log: Path) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as other:
-        port = port_of(other)
-        line = refused(ipsys, log, "stream", log, "--vrpn-port", port)
-    assert f"--vrpn: port {port} is in use, perhaps by another ipsys" in line
-
-
 REFUSED = {
     "--udp 10.0.0.1:9870": "is another machine",
     "--udp 9870 --robot eve": "robot 'eve' is not known; the rig has ada, bob",

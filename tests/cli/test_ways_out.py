@@ -85,14 +85,6 @@ def lens_file(lab: Path) -> Path:
     return path
 
 
-def test_unknown_distortion_model_of_a_file_names_the_way_out(ipsys: Ipsys, lab: Path) -> None:
-    path = lens_file(lab)
-    path.write_text(path.read_text().replace("equidistant", "double_sphere"))
-    line = refused(ipsys, lab, "detect", lab, "--calibration", f"red={path}")
-    assert "red.yaml, line 3: OpenCV: distortion model 'double_sphere' is not known" in line
-    assert "ipsys calibrate" in line
-
-
 def rig_file(lab: Path, *cameras: str) -> Path:
     """Return the rig of a log, with these cameras."""
     path = lab.with_name("lab.toml")
@@ -126,16 +118,6 @@ def test_rig_of_some_cameras_is_a_remark(ipsys: Ipsys, lab: Path) -> None:
     done = ipsys("detect", lab, "--rig", rig_file(lab), "--run", "bare")
     assert done.code == 0, done.err
     assert "describe" not in done.err
-
-
-def test_rig_of_other_cameras_is_refused_for_pictures(ipsys: Ipsys, lab: Path) -> None:
-    folder = lab.with_name("pictures") / "front"
-    folder.mkdir(parents=True)
-    with Session([lab]) as session:
-        (folder / "1.jpg").write_bytes(session.payloads(["/cameras/red/image"])[0].data)
-    rig, new = rig_file(lab, "left", "right"), lab.with_name("new.mcap")
-    line = refused(ipsys, lab, "import", "images", folder.parent, "-o", new, "--rig", rig)
-    assert "describes the cameras left, right, but the images are from front" in line
 
 
 def changed(lab: Path, name: str, change: Callable[[Message], Message | None]) -> Path:
@@ -261,16 +243,6 @@ def test_evaluate_interrupted_names_the_runs_that_are_complete(detected: Path) -
     assert f"ipsys: interrupted; complete in {detected}: " in err
     assert "rigid (fit" in err
     assert "To continue, repeat the command" in err
-
-
-@pytest.mark.slow
-def test_evaluate_interrupted_into_a_new_log_keeps_nothing(detected: Path, tmp_path: Path) -> None:
-    new = tmp_path / "new.mcap"
-    command = ["evaluate", detected, "-o", new]
-    code, err = interrupted_when(command, lambda: bool(list(tmp_path.glob("new.mcap*"))))
-    assert code == 130
-    assert f"ipsys: interrupted; {new} was not written" in err
-    assert list(tmp_path.glob("new.mcap*")) == []
 
 
 @pytest.mark.parametrize("files", [(), ("red.yaml", "white.yaml")])

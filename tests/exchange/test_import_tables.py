@@ -15,12 +15,8 @@ import ipsys_log as ipsys_api
 from ipsys_log import IpsysError
 from ipsys_log.engine.output import write_log
 from ipsys_log.exchange.import_tables import DetectionOptions, import_detections, pair_messages, read_pairs
-from ipsys_log.log.dataset import Session
-from ipsys_log.messages import RIG_TOPIC, CameraCalibration, Rig, RigCamera, RigMarker
-from ipsys_log.messages.channels import MODEL
-from ipsys_log.messages.rig_file import rig_toml
+from ipsys_log.messages import CameraCalibration, Rig, RigCamera, RigMarker
 from ipsys_log.units import NS_PER_S
-from tests.conftest import Ipsys
 
 START_NS = 1_700_000_000 * NS_PER_S
 RIG = Rig("lab", "DICT_4X4_50", 0.1, (RigMarker(1), RigMarker(7)), (RigCamera("red"), RigCamera("white")))
@@ -116,46 +112,6 @@ def test_imported_pairs_export_the_same_table(
         path.unlink()
 
 
-@pytest.mark.slow
-def test_imported_markers_give_the_same_camera_points(
-    ipsys: Ipsys, detected_log: Path, tmp_path: Path
-) -> None:
-    """The run of the import replaces the detection for all later stages."""
-    log, table = tmp_path / "part.mcap", tmp_path / "markers.csv"
-    assert ipsys("export", detected_log, "-o", table, "--table", "markers").code == 0
-    refused = ipsys("import", "detections", table, "--into", detected_log)
-    assert "import into a part without images: ipsys cut" in refused.err
-    assert ipsys("cut", detected_log, "-o", log, "--exclude-topics", "/cameras/*/image").code == 0
-    done = ipsys("import", "detections", table, "--into", log, "--run", "theirs")
-    assert done.code == 0, done.err
-    assert "run theirs: markers:" in done.out
-    assert ipsys("camera-frame", log).code == 0
-    assert ipsys("verify", log).code == 0
-    columns = ["log_time_ns", "camera", "marker_id", "x_m", "y_m", "z_m", "heading_rad"]
-    with ipsys_api.open(log) as opened, ipsys_api.open(detected_log) as original:
-        points = opened.table("camera_points", run="theirs")[columns]
-        pd.testing.assert_frame_equal(points, original.table("camera_points")[columns], check_exact=True)
-
-
-@pytest.mark.slow
-def test_imported_pairs_give_the_same_model(ipsys: Ipsys, detected_lab: Path, tmp_path: Path) -> None:
-    table, copy = tmp_path / "pairs.csv", tmp_path / "pairs.mcap"
-    with Session([detected_lab]) as session:
-        (tmp_path / "lab.toml").write_text(rig_toml(session.payloads([RIG_TOPIC])[-1]))
-    assert ipsys("export", detected_lab, "-o", table, "--table", "pairs").code == 0
-    done = ipsys("import", "pairs", table, "-o", copy, "--rig", tmp_path / "lab.toml")
-    assert done.code == 0, done.err
-    parameters = []
-    for log in (detected_lab, copy):
-        assert ipsys("fit", log, "--model", "poly").code == 0
-        with Session([log]) as session:
-            (model,) = session.payloads(session.topics(MODEL, "poly"))
-            parameters.append([[one.values for one in camera.parameters] for camera in model.cameras])
-    for own, imported in zip(*parameters, strict=True):
-        for values, others in zip(own, imported, strict=True):
-            np.testing.assert_allclose(others, values, rtol=1e-9)
-
-
 HEADER = "time,camera,marker_id," + ",".join(CORNERS)
 ROW = "2023-11-14T22:13:20Z,red,1,0,0,1,0,1,1,0,1"
 
@@ -186,7 +142,6 @@ def test_faulty_detections_are_one_line(text: str, reason: str, tmp_path: Path) 
 
 
 PAIR_HEADER = "id,camera,xc_m,yc_m,zc_m,xw_m,yw_m,zw_m,marker_id"
-PAIR = "a,red,0,0,2,1,1,0,1"
 
 
 @pytest.mark.parametrize(

@@ -64,10 +64,10 @@ def test_log_that_is_not_in_the_folder_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_excluded_outlier_leaves_the_fit_out_of_date_and_then_good(tmp_path: Path, lab_log: Path) -> None:
+def test_excluded_outlier_leaves_a_fit_out_of_date_then_good(tmp_path: Path, detected_log: Path) -> None:
     folder = LabFolder(tmp_path)
     write_new(simulated_lab_texts(folder.rig_file))
-    log = Path(shutil.copy(lab_log, tmp_path / "calibration.mcap"))
+    log = Path(shutil.copy(detected_log, tmp_path / "calibration.mcap"))
     with Session([log]) as session:
         messages = list(session.messages(session.topics(MEASUREMENTS)))
     point = messages[len(messages) // 2].payload

@@ -59,12 +59,6 @@ def test_several_wrong_values_are_faults_of_all_their_fields() -> None:
     assert [fault.field for fault in faults] == ["marker_length_m", "second_x_m"]
 
 
-def test_equal_reference_points_are_a_fault() -> None:
-    same = {"first_x_m": "1", "first_y_m": "2", "second_x_m": "1", "second_y_m": "2"}
-    _, (fault,) = check_rig_entry(same, example_rig())
-    assert (fault.field, "two reference points are at" in fault.text) == ("second_x_m", True)
-
-
 def test_reference_points_that_give_poor_positions_are_warned_of() -> None:
     assert rig_warnings(example_rig()) == []
     rig, _ = check_rig_entry({"second_x_m": "1.3"}, example_rig())

@@ -96,11 +96,11 @@ def test_append_to_a_larger_log(tmp_path: Path) -> None:
     chance = random.Random(3)
     rows = [("/image/a", k * 10**8, k, chance.randbytes(40_000)) for k in range(60)]
     path = create(tmp_path / "session.mcap", rows)
-    for number in range(3):
+    for number in range(2):
         old = path.read_bytes()
         more = [(f"/runs/{number}/{k % 3}", k * 10**8, k, chance.randbytes(3_000)) for k in range(400)]
         operations = record_append(path, more)
-        check_append(tmp_path / f"crashed{number}", old, path.read_bytes(), operations, tries=60)
+        check_append(tmp_path / f"crashed{number}", old, path.read_bytes(), operations, tries=20)
 
 
 def is_repaired(path: Path) -> bool:
@@ -160,17 +160,6 @@ def test_recording_cut_at_every_point(tmp_path: Path) -> None:
     kept = check_recording(tmp_path / "crashed", rows, operations, tries=6)
     assert {0, len(rows)} <= kept
     assert len(kept) > 5
-
-
-@pytest.mark.slow
-def test_larger_recording(tmp_path: Path) -> None:
-    chance = random.Random(6)
-    rows: list[Row] = []
-    for k in range(120):
-        rows.append((f"/image/{k % 3}", k * 10**8, k, chance.randbytes(20_000)))
-        rows.append(("/points", k * 10**8 + 1, k, chance.randbytes(50)))
-    operations = record_recording(tmp_path / "recording.mcap", rows)
-    check_recording(tmp_path / "crashed", rows, operations, tries=10)
 
 
 def test_results_of_a_frame_are_never_stored_without_the_frame(tmp_path: Path) -> None:

@@ -87,7 +87,7 @@ def test_repair_after_much_damage_converges() -> None:
     complaints: list[str] = []
     run(
         int(os.environ.get("IPSYS_DAMAGE_SEED", "12")),
-        int(os.environ.get("IPSYS_DAMAGE_CASES", "2000")),
+        int(os.environ.get("IPSYS_DAMAGE_CASES", "1000")),
         complaints.append,
     )
     assert complaints == []

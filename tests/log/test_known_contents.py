@@ -15,8 +15,7 @@ from ipsys_log.log.known_contents import one_reading
 from ipsys_log.log.reader import LogReader
 from ipsys_log.log.summary import load_contents
 from ipsys_log.log.writer import LogWriter
-from tests.conftest import ROOT, Ipsys
-from tests.tiers import first_fast
+from tests.conftest import ROOT
 
 
 class Parses:
@@ -46,16 +45,6 @@ def append(path: Path, topic: str) -> None:
     with LogWriter.append(path) as writer:
         writer.add_channel(topic, Schema("A", "jsonschema", b"{}"), "json")
         writer.write(topic, 2**60, 2**60, b"{}")
-
-
-@pytest.mark.parametrize("command", first_fast(2, ["replay", "evaluate --model poly", "verify", "runs"]))
-def test_command_parses_a_summary_once(ipsys: Ipsys, log: Path, parses: Parses, command: str) -> None:
-    if command == "verify":
-        assert ipsys("replay", log).code == 0
-        parses.count = 0
-    name, *options = command.split()
-    assert ipsys(name, log, *options).code == 0
-    assert parses.count == 1
 
 
 def test_contents_of_an_append_are_those_of_the_file(log: Path, parses: Parses) -> None:
@@ -94,30 +83,3 @@ def test_file_of_the_same_name_is_read(log: Path, tmp_path: Path) -> None:
         other.rename(log)
         with LogReader(log) as reader:
             assert "/a" in reader.channels
-
-
-def test_abandoned_append_leaves_what_is_known(log: Path, parses: Parses) -> None:
-    with one_reading():
-        with LogWriter.append(log) as writer:
-            writer.add_channel("/a", None, "json")
-            writer.write("/a", 2**60, 2**60, b"{}")
-            writer.abandon()
-        with LogReader(log) as reader:
-            assert "/a" not in reader.channels
-    assert parses.count == 1
-
-
-def test_outside_of_a_command_every_opening_reads(log: Path, parses: Parses) -> None:
-    for _ in range(2):
-        with LogReader(log):
-            pass
-    assert parses.count == 2
-
-
-def test_inner_block_shares_what_it_reads(log: Path, parses: Parses) -> None:
-    with one_reading():
-        with one_reading(), LogReader(log):
-            pass
-        with LogReader(log):
-            pass
-    assert parses.count == 1

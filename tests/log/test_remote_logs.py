@@ -148,28 +148,3 @@ def test_evaluation_of_a_url_is_that_of_the_file(store: Store, lab_copy: Path, i
     assert remote.out == local.out
     with ipsys_log.open(url, "results.mcap") as one, ipsys_log.open(lab_copy) as other:
         assert encoded(one, "evaluation", "model") == encoded(other, "evaluation", "model")
-
-
-# Eight commands, twice.
-@pytest.mark.slow
-def test_every_reading_command_takes_a_url(store: Store, lab_copy: Path, ipsys: Ipsys) -> None:
-    ipsys("evaluate", lab_copy, "--model", "rigid")
-    url = store.put("/a/lab.mcap", lab_copy.read_bytes())
-    for words in (
-        ("runs", "{}", "--json"),
-        ("check", "{}", "--json"),
-        ("du", "{}", "--json"),
-        ("cat", "{}", "--json"),
-        ("verify", "{}", "--run", "rigid"),
-        ("export", "{}", "-o", "points.csv", "--table", "camera_points"),
-        ("report", "{}", "--model", "rigid", "--html", "page.html"),
-        ("replay", "{}", "--model", "rigid"),
-    ):
-        local = ipsys(*(word.format(lab_copy) for word in words))
-        files = {
-            path.name: path.read_bytes() for path in Path().iterdir() if path.suffix in (".csv", ".html")
-        }
-        remote = ipsys(*(word.format(url) for word in words))
-        assert (remote.code, remote.out) == (local.code, local.out.replace(str(lab_copy), url)), words
-        for name, content in files.items():
-            assert Path(name).read_bytes() == content, words

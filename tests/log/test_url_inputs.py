@@ -36,7 +36,6 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     "words",
     [
         ("cut", "{}", "--cameras", "red", "-o", "{out}"),
-        ("compact", "{}", "-o", "{out}"),
         ("merge", "{red}", "{white}", "--offset", "white=0.5", "-o", "{out}"),
     ],
 )
@@ -45,13 +44,6 @@ def test_new_log_from_a_url_is_that_from_the_file(
 ) -> None:
     local = {"": here / "lab.mcap"}
     shutil.copy(GOLDEN, local[""])
-    if "compact" in words:  # needs a superseded run
-        shutil.copy(PAPER_LAB, local[""])
-        api.replay(local[""], models=("rigid",), until="fit")
-        with api.open(local[""]) as log:
-            point = log.table("measurements")["id"].iloc[0]
-        assert ipsys("exclude", local[""], point, "--reason", "wrong").code == 0
-        api.replay(local[""], models=("rigid",), until="fit")
     for camera in ("red", "white") if "merge" in words else ():
         local[camera] = here / f"{camera}.mcap"
         without = ("--exclude-topics", "/measurements") if camera == "white" else ()
@@ -62,13 +54,6 @@ def test_new_log_from_a_url_is_that_from_the_file(
         done = ipsys(*(word.format(logs[""], out=output, **named) for word in words))
         assert done.code == 0, done.err
     assert Path("remote.mcap").read_bytes() == Path("local.mcap").read_bytes()
-
-
-@pytest.mark.slow
-def test_difference_to_a_log_at_a_url(store: Store, here: Path, ipsys: Ipsys) -> None:
-    url = store.put("/lab.mcap", GOLDEN.read_bytes())
-    done = ipsys("diff", GOLDEN, url)
-    assert (done.code, "no difference" in done.out) == (0, True), done.err
 
 
 # Two evaluations.

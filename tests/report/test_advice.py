@@ -5,16 +5,12 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
 from ipsys_log.app.report.advice import ALL_MODELS, HEIGHT_KNOWN, PAPER, SIMPLE, advise
 from ipsys_log.app.report.findings import Findings
-from ipsys_log.engine.output import write_log
-from ipsys_log.exchange.imsel import read_imsel
 from ipsys_log.messages import CameraEvaluation, ErrorStatistics, Evaluation, LearningPoint
-from tests.report.conftest import find
 
 # half of the 95 % interval of the mean, as a share of the mean
 WIDE, NARROW = 0.3, 0.01
@@ -69,15 +65,6 @@ def test_random_subsets_of_the_paper_data_agree(paper: Findings) -> None:
     assert not advice.published
     assert {advice.choices[places][SIMPLE].model for places in (5, 7, 10)} == {"rigid"}
     assert {advice.choices[places][SIMPLE].model for places in (30, 40)} == {"poly"}
-
-
-@pytest.mark.slow
-def test_own_models_need_fewer_points_on_the_paper_data(data: Path, tmp_path: Path) -> None:
-    write_log(tmp_path / "imsel.mcap", read_imsel(data / "imsel"))
-    advice = find(tmp_path / "imsel.mcap", ("rigid", "poly", "rayplane", "best")).advice
-    assert advice is not None
-    assert advice.sentences[1].startswith("Model best with 10 points is as good as poly with 40")
-    assert advice.sentences[2].startswith("With known marker heights, model rayplane with 10 points")
 
 
 def test_the_simplest_model_within_the_noise_is_used() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import csv
 import io
 import json
@@ -13,12 +14,16 @@ import cv2
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
 from matplotlib.quiver import Quiver
 from matplotlib.text import Text
 
 from ipsys_log.app.report.accuracy import Accuracy, accuracy_json
+from ipsys_log.app.report.drive_figures import DrawnTrack, draw_tracks, read_drawn_tracks
 from ipsys_log.app.report.figures import png
 from ipsys_log.app.report.findings import Findings
+from ipsys_log.app.report.html_figures import overlap_pictures
+from ipsys_log.app.report.html_sections import overlap_tables
 from ipsys_log.app.report.paper_figures import (
     cross_validation_csv,
     models_figure,
@@ -29,8 +34,12 @@ from ipsys_log.app.report.paper_figures import (
 )
 from ipsys_log.app.report.points_figures import learning_figure, places_figure, published_figure
 from ipsys_log.engine.output import write_log
-from ipsys_log.messages import Residual
+from ipsys_log.log.dataset import Session
+from ipsys_log.messages import Floor, Message, Residual, Rig, Track, Tracks
+from ipsys_log.messages.channels import TRACKS
+from ipsys_log.statistics.disagreement import CameraPositions, PairDisagreement, compare_cameras
 from ipsys_log.statistics.ground_truth import TrajectoryErrors
+from ipsys_log.units import NS_PER_S
 from tests.conftest import Ipsys
 from tests.report.conftest import find, lab_messages, many_models, only, scale, with_accuracies
 
@@ -258,3 +267,96 @@ def shrink(residual: Residual) -> Residual:
     """Return the residual with a fifth of its error."""
     error_m = residual.predicted_m - residual.world_m
     return replace(residual, predicted_m=residual.world_m + 0.2 * error_m)
+
+
+EPOCH_NS, STEP_NS = 1_700_000_000_000_000_000, 50_000_000
+
+
+def write_tracks(path: Path) -> None:
+    """Write a robot that drives 1 m along x; from its middle on, another camera sees it."""
+    messages = []
+    for n in range(21):
+        time_ns = EPOCH_NS + n * STEP_NS + (n > 15) * 10 * STEP_NS
+        cameras = ("red",) if n < 10 else ("white",)
+        track = Track("ada", 3, 0.05 * n, 2.0, 0.1, 0.0, 4e-6 * np.eye(3), cameras, True)
+        messages.append(Message(TRACKS.topic_of("poly"), time_ns, time_ns, Tracks(time_ns, (track,))))
+    write_log(path, iter(messages))
+
+
+def test_drawn_track_has_breaks_regions_and_hand_overs(tmp_path: Path) -> None:
+    write_tracks(tmp_path / "drive.mcap")
+    with Session([tmp_path / "drive.mcap"]) as session:
+        tracks = read_drawn_tracks(session, "poly")
+    ada = tracks["ada"]
+    assert np.isnan(ada.line_m[:, 0]).nonzero()[0].tolist() == [16]
+    assert ada.hand_overs_m.tolist() == [[0.5, 2.0]]
+    assert np.diff(ada.regions[0][:, 0]).min() > 0.15
+    axes = Figure().add_subplot()
+    enlarged = draw_tracks(axes, tracks)
+    # The region of 95 % has a radius of 4.9 mm: ten times that is visible, twenty times is too large.
+    assert enlarged == 10
+    ellipse = axes.patches[0]
+    assert isinstance(ellipse, Ellipse)
+    np.testing.assert_allclose(ellipse.get_width() / enlarged, 2 * np.sqrt(-2 * np.log(0.05)) * 0.002)
+
+
+def test_log_without_tracks_has_none_to_draw(tmp_path: Path) -> None:
+    write_tracks(tmp_path / "drive.mcap")
+    with Session([tmp_path / "drive.mcap"]) as session:
+        assert read_drawn_tracks(session, "best") == {}
+    assert draw_tracks(Figure().add_subplot(), {}) >= 1
+
+
+def test_tracks_of_many_robots_look_different() -> None:
+    line_m, none_m = np.array([[0.0, 0.0], [1.0, 1.0]]), (np.empty((0, 2)), np.empty((0, 2, 2)))
+    tracks = {f"robot_{n}": DrawnTrack(line_m, none_m, np.empty((0, 2))) for n in range(20)}
+    axes = Figure().add_subplot()
+    draw_tracks(axes, tracks)
+    lines = [line for line in axes.lines if str(line.get_label()).startswith("robot")]
+    assert len({(line.get_color(), line.get_linestyle()) for line in lines}) == 20
+
+
+def pairs(
+    sigma_m: float | None, cameras: tuple[str, str] = ("red", "white"), apart_m: float = 0.005
+) -> list[PairDisagreement]:
+    """Return two cameras that differ in x, with a stated standard deviation."""
+    times_ns = np.arange(200) * NS_PER_S // 30
+    points_m = np.column_stack([1 + times_ns / NS_PER_S * 0.3, np.full(200, 2.0)])
+    covariances = np.broadcast_to((np.nan if sigma_m is None else sigma_m**2) * np.eye(2), (200, 2, 2))
+    ids = np.zeros(200, dtype=np.int64)
+    return compare_cameras(
+        [
+            CameraPositions(cameras[0], ids, times_ns, points_m + np.array([apart_m, 0.0]), covariances),
+            CameraPositions(cameras[1], ids, times_ns, points_m, covariances),
+        ]
+    )
+
+
+@pytest.mark.parametrize(
+    ("sigma_m", "within", "verdict"),
+    [(0.005, "100 %", "consistent"), (0.001, "0 %", "larger than the covariances explain"), (None, "-", "-")],
+)
+def test_row_says_whether_covariances_explain_it(sigma_m: float | None, within: str, verdict: str) -> None:
+    table = overlap_tables(pairs(sigma_m))["table"]
+    assert table is not None
+    (row,) = table.cells
+    assert row == ["red and white", "199", "5.0", "5.0", within, verdict]
+
+
+@pytest.mark.parametrize("rig", [None, Rig("lab", "DICT_4X4_100", 0.2, floor=Floor(4.88, 4.88))])
+def test_panel_has_a_map_and_a_time_course(rig: Rig | None) -> None:
+    shown = overlap_pictures(pairs(0.005), rig)
+    assert ["over the floor" in one["caption"] for one in shown] == [True, False]
+    for one in shown:
+        assert b"</svg>" in base64.b64decode(one["uri"].partition(",")[2])
+    assert shown == overlap_pictures(pairs(0.005), rig)
+
+
+def test_page_shows_the_pairs_that_differ_most_and_folds_all() -> None:
+    many = [pair for n in range(12) for pair in pairs(0.005, ("a", f"b{n}"), n / 1000)]
+    tables = overlap_tables(many)
+    assert tables["table"] is not None
+    assert tables["all"] is not None
+    assert [row[0] for row in tables["table"].cells] == [f"a and b{n}" for n in range(11, 1, -1)]
+    assert [row[0] for row in tables["all"].cells] == [f"a and b{n}" for n in range(12)]
+    assert overlap_tables(many[:3])["all"] is None

@@ -32,7 +32,8 @@ from ipsys_log.stages.detect import CORNERS
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "stages"
 LOG, EXPECTED = GOLDEN / "frames.mcap", GOLDEN / "expected.json"
-COMBINATIONS = [(corners, method) for corners in CORNERS for method in METHODS]
+# Each corner method and each method of poses once: neither knows of the other.
+COMBINATIONS = list(zip(CORNERS, METHODS, strict=True))
 _SAMPLES = 4  # number of stored messages per channel
 _DIGITS = 9
 # Tolerance of the stored numbers (px, m, rad) in another environment, by kind of channel. Corners move by up

@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mcap.reader import make_reader
 
 from ipsys_log.engine.graph import version_parameters
 from ipsys_log.engine.output import append_messages, write_log
@@ -26,18 +25,8 @@ from ipsys_log.tools.cut import compact, cut, superseded_runs
 from ipsys_log.tools.cut_selection import CutOptions
 from ipsys_log.tools.verify import verify
 from tests.conftest import Ipsys
+from tests.log.conftest import Row, stock_rows
 from tests.shared_files import make_once
-
-Row = tuple[str, int, int, bytes]
-
-
-def stock_rows(path: Path) -> list[Row]:
-    """Return all messages, read by the ``mcap`` package."""
-    with path.open("rb") as file:
-        return [
-            (channel.topic, message.log_time, message.publish_time, message.data)
-            for _, channel, message in make_reader(file, validate_crcs=True).iter_messages()
-        ]
 
 
 def run_of(row: Row) -> str | None:

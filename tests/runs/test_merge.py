@@ -15,7 +15,6 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from ipsys_log.engine.output import write_log
-from ipsys_log.errors import IpsysError
 from ipsys_log.log.codec import encode
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.merged_logs import shift_times
@@ -273,15 +272,3 @@ def test_wrong_arguments_are_refused_with_one_line(
     assert (done.code, done.out) == (1, "")
     assert text in done.err.replace("\n", " ")
     assert not list(tmp_path.glob("all*"))
-
-
-def test_damaged_log_leaves_no_merged_log(tmp_path: Path) -> None:
-    a, b = (tmp_path / f"{name}.mcap" for name in ("a", "b"))
-    write_recording(a, "red", TIMES_NS)
-    write_recording(b, "white", TIMES_NS)
-    data = bytearray(b.read_bytes())
-    data[data.index(bytes([2]) * 40_000) + 20_000] ^= 1
-    b.write_bytes(data)
-    with pytest.raises(IpsysError, match="CRC of the chunk is wrong"):
-        merge([a, b], tmp_path / "all.mcap", [LogOffset(), LogOffset(5)])
-    assert sorted(tmp_path.iterdir()) == [a, b]

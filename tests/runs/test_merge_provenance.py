@@ -18,7 +18,6 @@ from ipsys_log.live_runs.pipeline import replay
 from ipsys_log.log.codec import decode, encode, schema_name
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.merged_logs import shift_times
-from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import Message
 from ipsys_log.messages.channels import MODEL, TRACKS
 from ipsys_log.tools.cut import cut
@@ -27,7 +26,6 @@ from ipsys_log.tools.merge import merge
 from ipsys_log.tools.merge_plan import LogOffset
 from ipsys_log.tools.soundness.check import check_logs
 from ipsys_log.tools.verify import verify
-from tests.conftest import Ipsys
 from tests.shared_files import make_once
 
 pytestmark = pytest.mark.slow  # three logs with all stages
@@ -135,38 +133,6 @@ def test_verify_of_a_merge_repeats_the_runs_with_whole_inputs(merged_log: Path) 
             assert comparisons[f"/runs/stock/cameras/{camera}/{name}"].repeated == is_repeated
     assert comparisons["/runs/rigid/tracks"].repeated
     assert not comparisons["/cameras/red/image"].repeated
-
-
-@pytest.mark.parametrize("topic", ["/cameras/white/image", "/runs/stock/cameras/white/markers"])
-def test_changed_byte_in_a_merge_is_found(ipsys: Ipsys, merged_log: Path, tmp_path: Path, topic: str) -> None:
-    """The log is written again with one changed byte, its hashes and CRCs are right."""
-    changed = tmp_path / "changed.mcap"
-    with Session([merged_log]) as session, LogWriter.create(changed) as writer:
-        (reader,) = session.readers
-        is_changed = False
-        for raw in reader.messages():
-            channel = reader.channels[raw.topic]
-            writer.add_channel(raw.topic, channel.schema, channel.message_encoding, channel.metadata)
-            data = bytes(raw.data)
-            if raw.topic == topic and not is_changed and len(data) > 50:
-                data, is_changed = data[:-9] + bytes([data[-9] ^ 1]) + data[-8:], True
-            writer.write(raw.topic, raw.log_time_ns, raw.publish_time_ns, data)
-    assert is_changed
-    done = ipsys("verify", changed)
-    assert done.code == 1, done.out + done.err
-
-
-def test_more_measurements_make_a_model_out_of_date(recorders_log: Recorders, tmp_path: Path) -> None:
-    """A channel with messages of both logs is not the channel that the stage has read."""
-    second, output = tmp_path / "b.mcap", tmp_path / "all.mcap"
-    with Session([recorders_log.second]) as session, Session([recorders_log.first]) as other:
-        messages = list(session.messages(["/rig", *session.images.values(), *session.calibrations.values()]))
-        point = next(other.messages(["/measurements"]))
-    write_log(second, [*messages, replace(point, payload=replace(point.payload, id="p999"))])
-    merge([recorders_log.first, second], output, [LogOffset(), LogOffset()])
-    found = states(output)
-    assert ("rigid", "fit", "out of date: measurements changed") in found
-    assert ("stock", "detect", "current") in found
 
 
 def test_merge_of_parts_and_part_of_a_merge_keep_the_chain(recorders_log: Recorders, tmp_path: Path) -> None:

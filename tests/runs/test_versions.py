@@ -151,22 +151,6 @@ def test_state_does_not_depend_on_the_order_of_logs(
     assert found[0]["poly", "fuse"] == "out of date: input poly is"
 
 
-def test_changed_model_leaves_the_detection_alone(
-    ipsys: Ipsys, log: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(VERSIONS, "poly", 2)
-    found = made(ipsys, log)
-    assert {stage: new for stage, (_, new) in found.items()} == {
-        "detect": False,
-        "camera-frame": False,
-        "fit": True,
-        "evaluate": True,
-        "locate": True,
-        "fuse": True,
-    }
-    assert found["fuse"][0] == "poly_2"
-
-
 def test_run_of_newer_software_is_never_replaced(
     ipsys: Ipsys, log: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

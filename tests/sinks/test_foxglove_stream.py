@@ -26,7 +26,6 @@ from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin, Subprotocol
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.log import codec as log_codec
 from ipsys_log.messages import CompressedImage, Event, Message
 from ipsys_log.sinks.sink import DropReport
 from ipsys_log.sinks.streams import foxglove as foxglove_stream
@@ -284,26 +283,6 @@ def test_any_text_of_a_client_is_read_or_refused(text: str) -> None:
     subscriptions = Subscriptions()
     with suppress(ValueError):
         assert subscriptions.read(text) == []
-
-
-def test_messages_without_a_subscriber_are_not_serialised(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A recording has hundreds of messages in a second; a viewer shows a few topics."""
-    serialised: list[str] = []
-
-    def encode(payload: Any) -> bytes:
-        serialised.append(type(payload).__name__)
-        return log_codec.encode(payload)
-
-    monkeypatch.setattr(foxglove_stream, "encode", encode)
-    with streaming() as (stream, _), opened(stream) as client:
-        wait_until(lambda: stream.client_count, "a client is connected")
-        send_all(stream, [tracks(0)] * 3)
-        assert serialised == []
-        subscribed(client, 1)
-        wait_for_subscription(stream)
-        send_all(stream, [tracks(1)])
-        assert isinstance(client.recv(_LIMIT_S), bytes)
-    assert serialised == ["Tracks"]
 
 
 def test_ended_subscription_gets_no_message() -> None:

@@ -187,18 +187,6 @@ def test_static_transforms_reach_late_subscribers(bag: Path) -> None:
     assert not any(profiles.values())
 
 
-def test_bag_is_a_log_again(bag: Path, replayed_log: Path) -> None:
-    with Session([bag]) as found, Session([replayed_log]) as known:
-        for camera, topic in known.images.items():
-            images = found.payloads([found.images[camera]])
-            assert [i.data for i in images] == [i.data for i in known.payloads([topic])]
-            (first, *_), (stored,) = (
-                session.payloads([session.calibrations[camera]]) for session in (found, known)
-            )
-            assert first.distortion_model == stored.distortion_model == "kannala_brandt"
-            assert np.array_equal(first.K, stored.K)
-
-
 FINITE = st.floats(-1e6, 1e6)
 MODELS = st.sampled_from([("kannala_brandt", 4), ("plumb_bob", 5), ("rational_polynomial", 8)])
 

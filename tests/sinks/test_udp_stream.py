@@ -19,7 +19,6 @@ import pytest
 import ipsys_log as ipsys
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Message
-from ipsys_log.sinks.sink import FanOut
 from ipsys_log.sinks.streams.poses import NewSession, PoseSource
 from ipsys_log.sinks.streams.udp import UdpStream, encode_pose
 from ipsys_log.units import NS_PER_S
@@ -221,32 +220,6 @@ def test_lost_datagrams_are_counted_and_reported(monkeypatch: pytest.MonkeyPatch
     assert {kind for kind, _ in events} == {"sink_dropped"}
     assert [text.split("(")[0] for _, text in events] == [
         f"UDP 127.0.0.1:9: {count} dropped " for count in ("1 message", "10 messages", "25 messages")
-    ]
-
-
-def test_sink_that_is_too_slow_reports_its_drops() -> None:
-    released = threading.Event()
-
-    class Slow:
-        name = "slow"
-        payloads: tuple[type, ...] = (str,)
-
-        def consume(self, messages: Iterator[Message | None]) -> None:
-            released.wait(240)
-            self.count = sum(message is not None for message in messages)
-
-    events: list[str] = []
-    slow = Slow()
-    with FanOut([slow], lambda kind, text: events.append(f"{kind}: {text}")) as sinks:
-        for number in range(215):
-            sinks(tracks(number))  # not wanted, so not counted
-            sinks(Message("/text", number, number, "text"))
-        released.set()
-    assert slow.count == 200
-    assert events == [
-        "sink_dropped: slow: 1 message dropped (the sink is too slow)",
-        "sink_dropped: slow: 10 messages dropped (the sink is too slow)",
-        "sink_dropped: slow: 15 messages dropped (in all)",
     ]
 
 

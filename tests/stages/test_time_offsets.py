@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ipsys_log.calibration.joint.fit import fit_jointly
+from ipsys_log.calibration.joint.from_messages import gather_observations
+from ipsys_log.calibration.joint.payload import joint_payload
 from ipsys_log.capture.simulation.calibration_points import plan_points
 from ipsys_log.capture.simulation.cameras import mount_cameras
 from ipsys_log.capture.simulation.lab import simulate, start_of_set_ns
@@ -20,13 +24,18 @@ from ipsys_log.live_runs.pipeline import replay
 from ipsys_log.log.codec import encode
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
+    EVENTS_TOPIC,
     RIG_TOPIC,
+    STAMP_UNRELIABLE,
     TRUTH_TOPIC,
     CameraPoint,
     CameraPoints,
+    Event,
     FrameTransform,
     FrameTransforms,
     ImageAnnotations,
+    Markers,
+    Measurement,
     Message,
     Pair,
     Position,
@@ -39,10 +48,13 @@ from ipsys_log.messages import (
     Vector3,
 )
 from ipsys_log.messages.channels import POSITIONS, TRACKS
+from ipsys_log.models.locate_corners import LocateCorners
 from ipsys_log.models.locate_points import LocatePoints
 from ipsys_log.stages import fuse
 from ipsys_log.statistics.camera_models import fit_model
 from ipsys_log.statistics.ground_truth import gather_tracks, track_errors
+from tests.geometric.lab import GeometricSettings, build_lab
+from tests.geometric.session import geometric_rig, simulate_session
 
 MS = 1_000_000
 RIG = Message(RIG_TOPIC, 0, 0, Rig("lab", "DICT_4X4_100", 0.2, tuple(RigMarker(n) for n in range(9))))
@@ -173,3 +185,67 @@ def test_messages_have_the_times_of_their_payloads(rolling: Path) -> None:
         topics = [topic for reader in session.readers for topic in reader.channels]
         for message in session.messages(topics):
             assert times_in(message.payload) <= {message.publish_time_ns}, message.topic
+
+
+def test_positions_have_the_time_of_the_reference_camera() -> None:
+    own = LabSettings(seed=3, rate_hz=10.0, drive_s=40.0, markers=2)
+    lab = build_lab(GeometricSettings(lab=own, points=16, clock_offset_s=0.02))
+    messages = list(simulate_session(lab))
+    measurements = [m.payload for m in messages if isinstance(m.payload, Measurement)]
+    seen = [message for message in messages if isinstance(message.payload, Markers)]
+    markers = {
+        camera.name: [message.payload for message in seen if message.camera == camera.name]
+        for camera in lab.cameras
+    }
+    fit = fit_jointly(gather_observations(geometric_rig(lab), lab.calibrations, markers, measurements))
+    locate = LocateCorners(joint_payload(fit, {}, 0))
+    list(locate(next(message for message in messages if message.topic == "/rig")))
+    offsets_ns: dict[str, int] = {}
+    for message in seen:
+        for payload in (one for one in locate(message) if isinstance(one, Positions)):
+            offsets_ns |= {str(message.camera): p.time_offset_ns or 0 for p in payload.positions}
+    late_ns = lab.clock_offsets_ns
+    reference = min(offsets_ns, key=lambda camera: abs(offsets_ns[camera]))
+    assert max(late_ns.values()) - min(late_ns.values()) > 10_000_000
+    for camera, offset_ns in offsets_ns.items():
+        assert abs(offset_ns - (late_ns[reference] - late_ns[camera])) < 500_000
+
+
+def place(time_ns: int, camera: str = "red") -> Message:
+    positions = Positions(time_ns, (Position(1, 1.0, 2.0, 0.0),))
+    return Message(f"/runs/poly/cameras/{camera}/positions", time_ns, time_ns, positions, camera)
+
+
+def late(time_ns: int, start_ns: int, end_ns: int | None = None, kind: str = STAMP_UNRELIABLE) -> Message:
+    event = Event(time_ns, kind, "", "red", None, start_ns, end_ns)
+    return Message(EVENTS_TOPIC, time_ns, time_ns, event)
+
+
+def times_of_tracks(messages: Sequence[Message]) -> list[int]:
+    rig = Message(RIG_TOPIC, 0, 0, Rig("lab", "DICT_4X4_100", 0.2))
+    made = run([rig, *messages], [wire(fuse.STAGE, "poly", {POSITIONS: "poly"}, fuse.Fuse("poly"))])
+    return [message.payload.timestamp for message in made if isinstance(message.payload, Tracks)]
+
+
+def test_late_frames_have_no_tracks() -> None:
+    messages = [place(10), late(50, 20), place(60), place(80), late(90, 20, 80), place(100)]
+    assert times_of_tracks(messages) == [10, 100]
+
+
+def test_late_frames_without_an_end_have_no_tracks_to_the_end() -> None:
+    assert times_of_tracks([place(10), late(50, 20), place(60), place(10**12)]) == [10]
+
+
+def test_other_cameras_and_other_events_change_nothing() -> None:
+    messages = [late(5, 0, kind="camera_lost"), place(10), late(50, 20), place(60), place(61, "white")]
+    assert times_of_tracks(messages) == [10, 61]
+
+
+def test_late_frame_is_not_averaged_into_another_camera() -> None:
+    far = Positions(61, (Position(1, 9.0, 9.0, 0.0),))
+    other = Message("/runs/poly/cameras/white/positions", 61, 61, far, "white")
+    rig = Message(RIG_TOPIC, 0, 0, Rig("lab", "DICT_4X4_100", 0.2))
+    stage = wire(fuse.STAGE, "poly", {POSITIONS: "poly"}, fuse.Fuse("poly"))
+    made = run([rig, late(50, 20), place(60), other], [stage])
+    (tracks,) = (message.payload for message in made if isinstance(message.payload, Tracks))
+    assert (tracks.tracks[0].x_m, tracks.tracks[0].cameras) == (9.0, ("white",))

@@ -44,8 +44,7 @@ def leave(browser: Phone) -> None:
     browser.wait("location.href === 'about:blank'")
 
 
-@pytest.mark.parametrize("size", [PHONE, DESKTOP], ids=["phone", "desktop"])
-def test_dashboard_has_no_serious_fault(browser: Phone, tmp_path: Path, size: tuple[int, int]) -> None:
+def test_dashboard_has_no_serious_fault(browser: Phone, tmp_path: Path) -> None:
     model = Model(0, "poly", (CameraModel("red", (), pairs=pairs_of_a_level_camera()),))
     lab = LiveLab(tmp_path / "monday.mcap", model, {"red": LENS}, [Stream()])
     for n in range(30):
@@ -55,23 +54,22 @@ def test_dashboard_has_no_serious_fault(browser: Phone, tmp_path: Path, size: tu
     for kind in ("camera_lost", "camera_moved", "mark"):
         lab.feed(event(lab.time_ns, kind, f"an event of kind {kind}", "white"))
     with page_of(lab.dashboard) as page:
-        browser.open(page.url, size)
+        browser.open(page.url, PHONE)
         browser.wait("document.querySelector('figure image')")
         browser.tap("#take")
         says(browser, "#operation", "This device operates")
-        check(browser, size)
+        check(browser, "live")
         lab.end()
         says(browser, "#state", "recording ended")
         check(browser, "ended")
         leave(browser)
 
 
-@pytest.mark.parametrize("size", [PHONE, DESKTOP], ids=["phone", "desktop"])
-def test_measuring_page_has_no_serious_fault(browser: Phone, size: tuple[int, int]) -> None:
+def test_measuring_page_has_no_serious_fault(browser: Phone) -> None:
     with serve_app(build_app(Recording()), port=0) as page:
-        browser.open(page.url, size)
+        browser.open(page.url, PHONE)
         browser.wait("document.querySelector('#fields input')")
-        check(browser, size)
+        check(browser, "live")
         leave(browser)
 
 
@@ -89,16 +87,15 @@ def folder(tmp_path: Path, unmeasured: Unmeasured, replayed_log: Path, recorded:
     return folder
 
 
-@pytest.mark.parametrize("size", [PHONE, DESKTOP], ids=["phone", "desktop"])
-def test_setup_page_has_no_serious_fault(browser: Phone, folder: LabFolder, size: tuple[int, int]) -> None:
+def test_setup_page_has_no_serious_fault(browser: Phone, folder: LabFolder) -> None:
     setup = SetupApp(folder)
     with serve_app(setup.app, None, 0) as page:
-        browser.open(page.url, size)
+        browser.open(page.url, PHONE)
         for name in STEPS:
             browser.wait(f"document.querySelector('#step-{name}')")
             browser.run(f"location.hash = '{name}'")
             browser.wait(f"document.querySelector('#step-{name}[aria-current]')")
-            check(browser, (size, name))
+            check(browser, name)
         leave(browser)
         setup.session.close()
 

@@ -9,10 +9,9 @@ from pathlib import Path
 import pytest
 
 from ipsys_log.messages import CameraModel, Model
-from tests.ports import free_port
 from tests.web.contrast import low_contrasts
 from tests.web.dashboards import BEGIN_NS, LiveLab, event, frame, latency, markers, page_of, robot, tracks
-from tests.web.phone import Phone, phone
+from tests.web.phone import Phone
 from tests.web.test_dashboard_state import LENS, Stream, pairs_of_a_level_camera
 from tests.web.test_measuring_page import FETCHED, says
 
@@ -140,29 +139,6 @@ def test_operator_needs_only_the_keyboard(browser: Phone, lab: LiveLab) -> None:
         says(browser, "#take", "Take over")
 
 
-def test_two_pages_show_the_same_and_one_operates(browser: Phone, lab: LiveLab, tmp_path: Path) -> None:
-    with (
-        page_of(lab.dashboard) as page,
-        phone(tmp_path / "second") as other,
-        opened(browser, page.url, DESKTOP),
-        opened(other, page.url, PHONE),
-    ):
-        for one in (browser, other):
-            says(one, "#operation", "No device operates")
-        browser.tap("#take")
-        says(browser, "#operation", "This device operates")
-        says(other, "#operation", "Another device operates")
-        other.wait("!document.querySelector('#mark').checkVisibility()")
-        other.tap("#take")
-        says(other, "#operation", "This device operates")
-        says(browser, "#operation", "Another device operates")
-        browser.wait("!document.querySelector('#mark').checkVisibility()")
-        other.type("#mark", "robot pushed")
-        press(other, "Enter", "\r")
-        for one in (browser, other):
-            says(one, "#events", "robot pushed")
-
-
 def test_viewer_has_no_buttons(browser: Phone, lab: LiveLab) -> None:
     with page_of(lab.dashboard, "127.0.0.1") as page:
         assert page.view_url is not None
@@ -170,20 +146,6 @@ def test_viewer_has_no_buttons(browser: Phone, lab: LiveLab) -> None:
             says(browser, "#state", "live")
             browser.wait("document.querySelector('#operate-panel').hidden")
             assert browser.run("location.search") == ""
-
-
-def test_page_says_when_data_stop_and_goes_on_by_itself(browser: Phone, lab: LiveLab) -> None:
-    port = free_port()
-    with page_of(lab.dashboard, port=port) as page:
-        browser.open(page.url, PHONE)
-        says(browser, "#state", "live")
-    says(browser, "#state", "no data for")
-    with page_of(lab.dashboard, port=port):
-        says(browser, "#state", "live")
-        browser.send("Page.navigate", url="about:blank")
-    # A closed server is an error of the network, and the only one.
-    assert all('"network"' in text for text in browser.console)
-    browser.console.clear()
 
 
 def lose_network(browser: Phone, is_lost: bool) -> None:
@@ -212,7 +174,7 @@ def test_page_shows_the_newest_state_after_a_lost_network(browser: Phone, lab: L
     browser.console.clear()
 
 
-@pytest.mark.parametrize("size", [PHONE, DESKTOP, WALL], ids=["phone", "desktop", "wall"])
+@pytest.mark.parametrize("size", [PHONE, WALL], ids=["phone", "wall"])
 def test_page_fits_the_screen_in_both_schemes(browser: Phone, lab: LiveLab, size: tuple[int, int]) -> None:
     lab.operator.seat.claim(False)
     with page_of(lab.dashboard) as page, opened(browser, page.url, size):

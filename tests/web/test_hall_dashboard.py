@@ -112,17 +112,3 @@ def test_names_of_many_robots_leave_room_on_a_phone(browser: Phone, hall: LiveLa
             browser.wait(f"{COUNT.format('#floor .robot')} === 9")
             assert bool(browser.run(names)) == is_named
             says(browser, "#robots", "robot_8")
-
-
-def test_few_cameras_keep_their_outlines_and_rows(browser: Phone, tmp_path: Path) -> None:
-    lab = lab_of(tmp_path, ("black", "red", "white"))
-    with page_of(lab.dashboard) as page, opened(browser, page.url, DESKTOP):
-        browser.wait(f"{COUNT.format('figure image')} === 3")
-        says(browser, "#cameras", "white")
-        assert browser.run(COUNT.format("#floor .view")) == 3
-        assert [row[0] for row in browser.run(ROWS.format("#cameras"))] == ["black", "red", "white"]
-        assert browser.run(
-            "['#view', '#all-cameras'].every(one => !document.querySelector(one).checkVisibility())"
-        )
-        browser.tap("figure:nth-of-type(2)")
-        assert browser.run(COUNT.format("#floor .view")) == 3

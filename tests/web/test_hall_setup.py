@@ -118,15 +118,3 @@ def test_alignment_of_many_cameras_shows_those_to_turn(browser: Phone, tmp_path:
         browser.tap("#panel details summary")
         assert browser.run(COUNT.format(".card")) == 24
         assert browser.run("document.querySelectorAll('.card')[23].checkVisibility()")
-
-
-def test_setup_of_three_cameras_has_large_cards(browser: Phone, tmp_path: Path) -> None:
-    names = ("a1", "a4", "b1")
-    with serving(tmp_path, names, with_results) as url:
-        with opened(browser, url, "alignment", DESKTOP):
-            assert browser.run("[...document.querySelectorAll('.card')].every(one => one.checkVisibility())")
-            assert browser.run(COUNT.format(".card")) == 3
-            assert browser.run(COUNT.format("#panel details")) == 0
-        with opened(browser, url, "cameras", DESKTOP):
-            assert browser.run(COUNT.format(".many")) == 0
-            assert "No picture of" not in browser.text("#panel")

@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import fcntl
-import http.server
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 import pytest
 
@@ -118,30 +114,3 @@ def test_desktop_shows_cameras_and_entry_side_by_side(browser: Phone) -> None:
             "['#seen', '#entry'].map(part => document.querySelector(part))"
             ".every(part => part.scrollHeight <= part.clientHeight)"
         )
-
-
-@contextmanager
-def other_program() -> Iterator[str]:
-    """Another web page of this host; its cookie applies to all ports."""
-
-    class Handler(http.server.BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
-            self.send_response(200)
-            self.send_header("Set-Cookie", 'foo={"a":"b"}; Path=/')
-            self.end_headers()
-
-        def log_message(self, *_: object) -> None:
-            pass
-
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        yield f"http://127.0.0.1:{server.server_port}/"
-        server.shutdown()
-
-
-def test_cookie_of_another_program_does_not_block_a_phone(browser: Phone) -> None:
-    with other_program() as other, serve_app(build_app(Recording()), "127.0.0.1", 0) as page:
-        browser.open(other)
-        browser.open(page.url)
-        assert browser.run("location.pathname + location.search") == "/"
-        says(browser, "#sight", "is stationary")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,10 +12,8 @@ import pytest
 from ipsys_log.app.web.app import build_app
 from ipsys_log.app.web.server import serve_app
 from ipsys_log.engine.request import Request
-from ipsys_log.errors import LogError
 from ipsys_log.live_runs.survey.from_log import FinishedLog, open_finished_log
 from ipsys_log.live_runs.survey.scene import CameraView, StationaryInterval
-from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
     CameraPoint,
     CameraPoints,
@@ -28,7 +25,6 @@ from ipsys_log.messages import (
     Rig,
     RigMarker,
 )
-from ipsys_log.messages.channels import MEASUREMENTS
 from tests import labs
 from tests.conftest import Ipsys, Unmeasured
 from tests.test_measure import as_typed, foreign_read
@@ -132,59 +128,6 @@ def test_side_is_chosen_on_the_map_and_checked_by_the_model(
         says(hand, "#verdict", "Difference from the present model")
         hand.wait("document.querySelector('#save').innerText === 'Save p001'")
         hand.wait("document.querySelectorAll('#floor path.predicted').length > 0")
-
-
-@pytest.mark.slow
-def test_log_errors_are_shown_on_the_page(hand: Phone, unmeasured: Unmeasured) -> None:
-    log, tape = unmeasured
-    with open_finished_log(log, Request()) as scene, serve_app(build_app(scene), port=0) as page:
-        a, b, side, height = texts_at(scene, tape, 0)
-        hand.open(page.url)
-        says(hand, "#sight", "is stationary")
-        fill(hand, a, b, side, height)
-        with log.open("r+b") as other:
-            fcntl.flock(other, fcntl.LOCK_EX)
-            save(hand, "p001")
-            says(hand, "#notice", "another process is writing it")
-        # The typed values are still there, and are saved when the log is free.
-        assert hand.run("document.querySelector('#d-A').value") == a
-        save(hand, "p001")
-        says(hand, "#notice", "p001 is in the log")
-    assert len(foreign_read(log)) == 1
-    hand.tap("#after")
-    says(hand, "#notice", "The computer does not answer")
-
-
-@pytest.mark.slow
-def test_second_process_measures_in_the_same_log(hand: Phone, unmeasured: Unmeasured) -> None:
-    log, tape = unmeasured
-    with (
-        open_finished_log(log, Request()) as scene,
-        serve_app(build_app(scene), port=0) as page,
-        open_finished_log(log, Request()) as other,
-    ):
-        texts = texts_at(scene, tape, 0)
-        hand.open(page.url)
-        says(hand, "#sight", "is stationary")
-        fill(hand, *texts)
-        other.add([Measurement(tape[-1].timestamp, "p001", marker_id=1)])
-        save(hand, "p001")
-        says(hand, "#notice", "another program wrote measurements into this log (p001)")
-        says(hand, "#places", "p001")
-        assert hand.run("document.querySelector('#d-A').value") == texts[0]
-        # Without further action, the typed values are checked again, with the other process's entry.
-        save(hand, "p002")
-        says(hand, "#notice", "p002 is in the log")
-        other_id = "p003"
-        with pytest.raises(LogError):
-            other.add([Measurement(tape[-1].timestamp, other_id, marker_id=1)])
-        other.add([Measurement(tape[-1].timestamp, other_id, marker_id=1)])
-        hand.tap("#places li:first-child button")
-        says(hand, "#notice", "another program wrote measurements into this log (p003)")
-        hand.wait("document.querySelector('#places button[aria-label=\"Undo p002\"]')")
-        hand.tap("#places button[aria-label='Undo p002']")
-        says(hand, "#notice", "p002 is withdrawn")
-    assert sorted(row.id for row in foreign_read(log)) == ["p001", "p002", "p002_withdrawn", "p003"]
 
 
 class Recording:
@@ -320,27 +263,3 @@ def test_two_distances_need_the_side_and_three_show_residuals(hand: Phone) -> No
         save(hand, "p001")
         says(hand, "#places", "p001 marker 0")
     assert [tape.reference for tape in scene.done[0].distances] == ["A", "B", "C"]
-
-
-@pytest.mark.slow
-def test_points_are_measured_in_turn_with_a_token(hand: Phone, unmeasured: Unmeasured) -> None:
-    log, tape = unmeasured
-    with open_finished_log(log, Request()) as scene, serve_app(build_app(scene), "127.0.0.1", 0) as page:
-        hand.open(page.url)
-        # The token disappears from the address after its use.
-        assert hand.run("location.pathname + location.search") == "/"
-        for number in range(5):
-            says(hand, "#stop", f"interval {number + 1}/")
-            says(hand, "#sight", "is stationary")
-            fill(hand, *texts_at(scene, tape, number))
-            save(hand, f"p00{number + 1}")
-            says(hand, "#places", f"p00{number + 1}")
-        intervals = scene.intervals[:5]
-    with Session([log]) as session:
-        saved = session.payloads(session.topics(MEASUREMENTS))
-    for interval, one in zip(intervals, sorted(saved, key=lambda m: str(m.id)), strict=True):
-        (meant,) = [m for m in tape if interval.covers(m)]
-        assert interval.covers(one)
-        assert one.side == meant.side
-        read_m = [d.distance_m for d in one.distances]
-        assert read_m == pytest.approx([d.distance_m for d in meant.distances], abs=0.0001)

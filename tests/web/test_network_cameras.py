@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import http.server
 import json
 import threading
 from collections.abc import Iterator
@@ -62,14 +61,6 @@ def page_of(folder: Path) -> Iterator[Client]:
         assert server.exceptions.count == 0, server.exceptions.first
 
 
-def fault_of(page: Client, **typed: str) -> tuple[str, str]:
-    """Add a camera that cannot be used; return the field and the text of the fault."""
-    assert page.ask("/api/address", {"values": typed}) == (200, {})
-    page.job_ended()
-    fault = page.state()["address"]["fault"]
-    return fault["field"], fault["text"]
-
-
 def type_address(browser: Phone, address: str, user: str = "", password: str = "") -> None:
     for name, text in zip(FIELDS, (address, user, password), strict=False):
         browser.run(f"document.querySelector('#{name}').value = {json.dumps(text)}")
@@ -106,46 +97,6 @@ def test_password_of_a_network_camera_is_only_in_the_rig_file(
         browser.wait("document.querySelectorAll('.image img').length === 4")
         browser.wait(JOB_ENDED)
         assert "hush" not in json.dumps(Client(url).state())
-
-
-class NoVideo(http.server.BaseHTTPRequestHandler):
-    """A web page, a secret one, and no other."""
-
-    def do_GET(self) -> None:
-        status = {"/": 200, "/secret": 401}.get(self.path, 404)
-        self.send_response(status)
-        if status == 401:
-            self.send_header("WWW-Authenticate", 'Basic realm="camera"')
-        data = b"<html>a web page</html>" * 100
-        self.send_header("Content-Type", "text/html")
-        self.send_header("Content-Length", str(len(data)))
-        self.end_headers()
-        self.wfile.write(data)
-
-    def log_message(self, *_: object) -> None:
-        pass
-
-
-def test_faults_of_network_cameras_are_those_of_the_command_line(folder: Path) -> None:
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), NoVideo) as server, page_of(folder) as page:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        address = f"http://127.0.0.1:{server.server_port}/"
-        refusing = f"rtsp://127.0.0.1:{free_port()}/live"
-        for typed, field, text in (
-            (refusing, "address", "refuses the connection; check that the camera is on"),
-            (address, "address", "is not video; give the address of the stream"),
-            (f"{address}other", "address", "the camera has no such path"),
-            (f"{address}secret", "password", "the password is missing or not accepted"),
-        ):
-            found = fault_of(page, address=typed, user="admin", password="hush")
-            assert found[0] == field, found
-            assert text in found[1]
-            assert "hush" not in found[1]
-        assert (folder / "lab.toml").read_text() == RIG
-        # The next try forgets the fault.
-        assert page.ask("/api/address", {"values": {"address": "x"}})[0] == 409
-        assert page.state()["address"]["fault"] is None
-        server.shutdown()
 
 
 def test_camera_of_a_node_is_added_with_its_picture(

@@ -18,7 +18,6 @@ from tests.web.contrast import low_contrasts
 from tests.web.phone import Phone
 from tests.web.test_dashboard_browser import press
 from tests.web.test_measuring_page import FETCHED, says
-from tests.web.test_setup_page import Client
 
 # A browser.
 pytestmark = pytest.mark.slow
@@ -201,40 +200,3 @@ def test_every_step_fits_every_screen_in_both_schemes(browser: Phone, folder: Pa
                 for scheme in ("light", "dark"):
                     browser.prefer(scheme)
                     assert low_contrasts(browser) == [], (size, name, scheme)
-
-
-def test_keyboard_alone_reaches_the_next_step(browser: Phone, folder: Path) -> None:
-    with opened(browser, folder, DESKTOP):
-        browser.wait("document.querySelector('#simulate')")
-        focus(browser, "#simulate")
-        press(browser, "Enter", "\r")
-        browser.wait("document.querySelector('#onward')")
-        # The button has vanished; the focus stays in the panel.
-        browser.wait("document.activeElement.id === 'panel'")
-        focus(browser, "#onward")
-        press(browser, "Enter", "\r")
-        says(browser, "h2", "4. Alignment")
-        focus(browser, "#step-points")
-        press(browser, "Enter", "\r")
-        says(browser, "h2", "5. Calibration points")
-
-
-def test_second_device_takes_over_before_it_changes_anything(browser: Phone, folder: Path) -> None:
-    with opened(browser, folder) as url:
-        Visitor(browser).tap("#simulate")
-        says(browser, "#operation", "This device operates")
-        # Another device takes over: the page shows it, and its buttons wait.
-        other = Client(url)
-        other.operate(take_over=True)
-        says(browser, "#operation", "Another device operates")
-        browser.run("location.hash = 'rig'")
-        browser.wait("document.querySelector('#save').disabled")
-        browser.tap("#take")
-        says(browser, "#operation", "This device operates")
-        browser.wait("!document.querySelector('#save').disabled")
-        assert other.ask("/api/start", {"action": "align"})[0] == 400
-        # After a reload, and in another tab, it is the same device.
-        browser.reload()
-        says(browser, "#operation", "This device operates")
-        visit(browser, url)
-        says(browser, "#operation", "This device operates")

@@ -7,7 +7,6 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,14 +16,12 @@ import zenoh
 
 from ipsys_log.capture.frames import Clock, Frame, SourceError, SourceMessage
 from ipsys_log.capture.multiplexer import LiveCameras
-from ipsys_log.capture.nodes import node as node_module
 from ipsys_log.capture.nodes.centre import Centre, _Link
 from ipsys_log.capture.nodes.network import NodeNetwork, read_network
 from ipsys_log.capture.nodes.wire import FrameHeader, frames_key
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import RigCamera, RigNodes
 from tests.capture.nodes.lab_of_nodes import Received, ShiftedClock, make_certificates, receiving, sending
-from tests.capture.nodes.tcp_relay import Relay
 from tests.ports import free_port
 from tests.waiting import wait_until
 
@@ -67,55 +64,6 @@ def test_frames_arrive_unchanged_with_the_times_of_the_centre(tmp_path: Path) ->
                 assert frame.time_ns is not None
                 # The bound above is the exact test; here, no time is wrong by the offset.
                 assert abs(feed.times_ns[frame.data] - HOUR_NS - frame.time_ns) < HOUR_NS / 60
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("closes", [True, False], ids=["connection ends", "silence"])
-def test_frames_of_a_cut_network_arrive_later(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, closes: bool
-) -> None:
-    """The frames come from the log of the node: its memory holds none."""
-    monkeypatch.setattr(node_module, "_MOST_RECENT_BYTES", 0)
-    network = local()
-    with (
-        Relay(network.port, jitter_s=0.002) as relay,
-        sending(tmp_path, NodeNetwork("127.0.0.1", relay.port)) as feed,
-        Centre(cameras(), network, "0.1.0") as centre,
-        receiving(centre) as received,
-    ):
-        made = feed.record(10)
-        received.wait_for_data(made)
-        relay.cut(closes)
-        received.wait_until(lambda now: now.errors, "the node does not answer")
-        assert "camera red: its node does not answer" in str(received.errors[0])
-        made += feed.record(60)
-        relay.mend()
-        made += feed.record(5)
-        received.wait_for_data(made)
-        assert sorted(frame.data for frame in received.frames) == sorted(made)
-        received.wait_until(lambda now: now.kinds()[-1:] == ["node_gap_filled"], "the gap is filled")
-        assert received.kinds()[0] == "node_answers"
-        assert set(received.kinds()[1:]) == {"node_gap", "node_gap_filled"}
-        assert feed.node.finish(has_ended=True) == 0
-
-
-@pytest.mark.slow
-def test_node_that_starts_again_sends_its_new_session(tmp_path: Path) -> None:
-    network = local()
-    with Centre(cameras(), network, "0.1.0") as centre, ExitStack() as resources:
-        with sending(tmp_path, network) as feed:
-            received = resources.enter_context(receiving(centre))
-            made = feed.record(3)
-            received.wait_for_data(made)
-        with sending(tmp_path, network, clock=ShiftedClock(Clock(), -HOUR_NS)) as feed:
-            again = feed.record(4)
-            received.wait_until(lambda now: len(now.frames) == 7, "7 frames arrive")
-            assert sorted(frame.data for frame in received.frames[:3]) == made
-            assert sorted(frame.data for frame in received.frames[3:]) == sorted(again)
-            assert "node_restarted" in received.kinds()
-            for frame in received.frames[3:]:
-                assert frame.time_ns is not None
-                assert abs(feed.times_ns[frame.data] + HOUR_NS - frame.time_ns) < HOUR_NS / 60
 
 
 @pytest.mark.slow
@@ -179,29 +127,6 @@ def refused(network: NodeNetwork) -> bool:
     except zenoh.ZError:
         return True
     return False
-
-
-@pytest.mark.slow
-def test_other_version_and_second_node_are_refused_at_the_centre(tmp_path: Path) -> None:
-    network = local()
-    with (
-        Centre(cameras(), network, "0.1.0") as centre,
-        sending(tmp_path, network, version="0.2.0"),
-        pytest.raises(SourceError, match=r"has ipsys 0\.2\.0, but this machine has ipsys 0\.1\.0"),
-        centre.open(cameras()[0], Clock(), lambda text: None) as items,
-    ):
-        first_of(items)
-    network = local()
-    with (
-        Centre(cameras(), network, "0.1.0") as centre,
-        sending(tmp_path, network),
-        sending(tmp_path, network),
-        receiving(centre) as received,
-    ):
-        received.wait_until(
-            lambda now: any("two nodes send as camera red" in str(e) for e in now.errors),
-            "the second node is refused",
-        )
 
 
 @pytest.mark.slow

@@ -123,25 +123,6 @@ def test_recording_goes_on_after_the_end_of_the_process(tmp_path: Path) -> None:
     assert all("the process that receives its frames has ended by signal 9" in event.text for event in lost)
 
 
-@pytest.mark.slow
-def test_one_thread_reads_all_nodes(tmp_path: Path) -> None:
-    network, names = local(), ("red", "white", "black")
-    with (
-        Receiver(cameras(*names), network, VERSION) as receiver,
-        sending_always(tmp_path, network, *names),
-        LiveCameras(cameras(*names), receiver.choose_opener(open_source), Clock()) as live,
-    ):
-        threads = [thread.name for thread in threading.enumerate()]
-        seen: set[str] = set()
-        for message in live:
-            if message is not None and isinstance(message.payload, CompressedImage):
-                seen.add(message.payload.frame_id)
-            if seen == set(names):
-                live.stop()
-    assert threads.count("nodes") == 1
-    assert not set(names) & set(threads)
-
-
 def test_process_ends_with_the_pipe_of_its_recording() -> None:
     process = PipedProcess(serve)
     process.sender.send(_Setup((*cameras("red"),), local(), VERSION))

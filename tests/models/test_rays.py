@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from scipy.optimize import least_squares
 from sklearn.model_selection import KFold
 
+from ipsys_log.messages import Array
 from ipsys_log.models.rays import _USUAL_M, CalibrationPoints, _move, _residuals, _weights, fit_rays
 from ipsys_log.models.table import create, fit_cameras, group_dependent_cameras, inputs
 from tests import labs
@@ -51,8 +52,12 @@ def test_tied_cameras_are_at_the_optimum_of_scipy() -> None:
         for camera, own in zip((left, right), world, strict=True)
     ]
     rays, weights = fit_rays(cameras), _weights([name for places in cameras for name in places.names])
+
+    def residuals(step: Array) -> Array:
+        return _residuals(cameras, _move(rays, step), weights)
+
     solved = least_squares(
-        lambda step: _residuals(cameras, _move(rays, step), weights),
+        residuals,
         rng.normal(0, 0.003, 18),
         loss="soft_l1",
         f_scale=_USUAL_M,

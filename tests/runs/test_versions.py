@@ -48,6 +48,7 @@ def test_everything_that_computes_has_a_version() -> None:
 
 
 def test_version_is_named_from_the_second_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(VERSIONS, "kriging", 1)
     assert version_parameters("fit", "rigid+kriging") == {}
     monkeypatch.setitem(VERSIONS, "kriging", 3)
     assert version_parameters("fit", "rigid+kriging") == {"kriging": "3"}

@@ -10,7 +10,7 @@ cache. For ``ipsys live``, which plays the cameras of the sample and has its mod
 until the first datagram with positions.
 
 Answers: ``ipsys evaluate`` of all models and of ``joint``, and ``ipsys report``, on copies of the samples
-without any run; ``ipsys calibrate-lab`` on two minutes of drive and about 8 points, whose markers are
+without any run; ``ipsys calibrate-lab`` on two minutes of drive and 9 points, whose markers are
 detected. The ratio to another checkout is that of processor times.
 """
 
@@ -27,10 +27,9 @@ import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 from results import Report, command
-from rounds import Row
+from rounds import Row, Spent
 from scenes import CACHE, drawn, lengthened
 
 from ipsys_log.capture.simulation.settings import LabSettings
@@ -143,15 +142,8 @@ def _measure_starts(folder: Path, options: argparse.Namespace, report: Report) -
         report.details[name] = seconds
 
 
-class _Spent(NamedTuple):
-    """Wall and processor time of a command and its workers, in s."""
-
-    wall_s: float
-    cores_s: float
-
-
-def _answer(checkout: Path, log: Path, words: Sequence[str]) -> _Spent:
-    """Run a command of a checkout on a copy of a log."""
+def _answer(checkout: Path, log: Path, words: Sequence[str]) -> Spent:
+    """Run a command of a checkout on a copy of a log; its processor time includes that of its workers."""
     copied = Path(shutil.copy(log, log.with_name(f"answered_{log.name}")))
     arguments = [sys.executable, "-m", "ipsys_log", words[0], str(copied), *words[1:]]
     begin, before = time.perf_counter(), os.times()
@@ -165,12 +157,12 @@ def _answer(checkout: Path, log: Path, words: Sequence[str]) -> _Spent:
     wall_s, after = time.perf_counter() - begin, os.times()
     if done.returncode != 0:
         raise SystemExit(f"answers: {' '.join(arguments)}: {done.stderr}")
-    cores_s = after.children_user + after.children_system - before.children_user - before.children_system
-    return _Spent(wall_s, cores_s)
+    cpu_s = after.children_user + after.children_system - before.children_user - before.children_system
+    return Spent(wall_s, cpu_s)
 
 
 def _driven_lab(folder: Path, smoke: bool) -> Path:
-    """Return a log of two minutes of drive and about 8 points, with its markers."""
+    """Return a log of two minutes of drive and 9 points, with its markers."""
     settings = LabSettings(
         width=960, height=540, stations=3, frames_per_station=5, rate_hz=10.0, drive_s=5.0 if smoke else 120.0
     )
@@ -188,11 +180,11 @@ def _measure_answers(folder: Path, options: argparse.Namespace, report: Report) 
         log = Path(shutil.copy(_SAMPLES / sample, folder / sample)) if sample else driven
         turns = [[_answer(checkout, log, words) for checkout in checkouts] for _ in range(options.answers)]
         if options.other:
-            ratios = tuple(other.cores_s / this.cores_s for this, other in turns)
+            ratios = tuple(other.cpu_s / this.cpu_s for this, other in turns)
             report.rows.append(Row(f"{name}: other / this", ratios))
         own = [turn[0] for turn in turns]
         report.rows.append(Row(name, tuple(spent.wall_s for spent in own), "s", ("<=", wanted_s)))
-        report.rows.append(Row(f"{name}, processor", tuple(spent.cores_s for spent in own), "s"))
+        report.rows.append(Row(f"{name}, processor", tuple(spent.cpu_s for spent in own), "s"))
 
 
 def add_options(parser: argparse._ArgumentGroup) -> None:

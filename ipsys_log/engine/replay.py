@@ -1,7 +1,8 @@
 """The stages of a replay in order: those that all models share, and then those of each model.
 
-The evaluations of several models come from worker processes; this process appends them in order. The logs do
-not change while they are read: an append leaves the messages before it where they are.
+The evaluations of several models come from worker processes; this process appends them in order. Each worker
+reads the logs as they were when it opened them. If another program has changed the input of an evaluation
+since then, this process computes it again.
 """
 
 from __future__ import annotations
@@ -24,8 +25,9 @@ from ipsys_log.engine.workers import LocalWorkers
 from ipsys_log.errors import FitError, IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.location import LogLocation
-from ipsys_log.messages import Message
+from ipsys_log.messages import ChannelRead, Message
 from ipsys_log.messages.channels import CHANNELS, EVALUATION, IMAGES, MODEL, RUN_EVENTS, Channel
+from ipsys_log.messages.stage import Progress as StageProgress
 from ipsys_log.messages.stage import Stage
 from ipsys_log.stages import load_stage
 from ipsys_log.statistics.model_kinds import model_kind
@@ -123,12 +125,11 @@ class Replay:
             if MODEL in stage.writes and request.model_from is not None:
                 task: Task | str = copy_model(request, str(model))[0]
             else:
-                options = request.options(model)
-                task = plan_stage(stage, session, options, inputs, request.rig, request.lenses)
+                task = _plan(session, request, stage, inputs, model)
             if isinstance(task, str):
                 return task
             if runs is not None:
-                task = runs.task_of(str(model), task)
+                task = runs.task_of(session, str(model), task)
             until, target = self.stages[-1], self.target
             outcome = run_stage(
                 session, target, task, request, until, self._messages, self.say, self._prepare
@@ -174,11 +175,15 @@ class ModelPiece(NamedTuple):
 
 
 class ModelResult(NamedTuple):
-    """The payload of a stage for a model with its remarks, or the error of the input."""
+    """The payload of a stage for a model with its remarks, or the error of the input.
+
+    ``reads`` has the content that the stage has read; it is empty if the logs no longer have the input.
+    """
 
     model: str
-    payload: Any
-    notes: Sequence[str]
+    reads: tuple[ChannelRead, ...] = ()
+    payload: Any = None
+    notes: Sequence[str] = ()
     error: IpsysError | None = None
 
 
@@ -198,12 +203,14 @@ class ModelWork:
     def _compute(self, session: Session, piece: ModelPiece) -> ModelResult:
         inputs = {channel: piece.inputs[channel.name] for channel in CHANNELS if channel.name in piece.inputs}
         task = _plan(session, self.request, load_stage(piece.stage), inputs, piece.model)
-        assert isinstance(task, Task)
+        if not isinstance(task, Task):
+            return ModelResult(piece.model)
         assert task.compute is not None
+        reads = record_of(session, task).inputs
         try:
-            return ModelResult(piece.model, task.compute(lambda done, total: None), task.notes)
+            return ModelResult(piece.model, reads, task.compute(lambda done, total: None), task.notes)
         except IpsysError as error:
-            return ModelResult(piece.model, None, task.notes, error)
+            return ModelResult(piece.model, reads, error=error)
 
 
 class ModelPlan(NamedTuple):
@@ -218,7 +225,7 @@ class ModelPlan(NamedTuple):
 
 
 def _plan(
-    session: Session, request: Request, stage: Stage, inputs: Mapping[Channel, str], model: str
+    session: Session, request: Request, stage: Stage, inputs: Mapping[Channel, str], model: str | None
 ) -> Task | str:
     return plan_stage(stage, session, request.options(model), inputs, request.rig, request.lenses)
 
@@ -254,15 +261,18 @@ class ModelRuns:
         self._missing = {piece.model for piece in plan.pieces}
         self._results = workers.compute(plan)
 
-    def task_of(self, model: str, task: Task) -> Task:
-        """Return a task that takes its payload from a worker, if one computes it."""
+    def task_of(self, session: Session, model: str, task: Task) -> Task:
+        """Return a task that takes its payload from a worker, if one computes it from the same content."""
         if EVALUATION not in task.stage.writes or model not in self._missing:
             return task
-        return replace(task, compute=lambda progress: self._take(model, task.notes))
+        return replace(task, compute=partial(self._take, model, task, record_of(session, task).inputs))
 
-    def _take(self, model: str, notes: list[str]) -> Any:
+    def _take(self, model: str, task: Task, reads: tuple[ChannelRead, ...], progress: StageProgress) -> Any:
         result: ModelResult = next(one for one in self._results if one.model == model)
+        if result.reads != reads:
+            assert task.compute is not None
+            return task.compute(progress)
         if result.error is not None:
             raise result.error
-        notes[:] = result.notes
+        task.notes[:] = result.notes
         return result.payload

@@ -34,9 +34,8 @@ def with_remaining_error(
     ----------
     Satterthwaite, An approximate distribution of estimates of variance components, 1946.
     """
-    from scipy.special import (
-        gammaincinv,
-    )  # late: most commands evaluate nothing; scipy.stats takes 0.3 s more
+    # Late: most commands evaluate nothing. scipy.stats takes 0.3 s more.
+    from scipy.special import gammaincinv
 
     tapes = np.trace(tape_m2, axis1=1, axis2=2)
     if not (tapes > 0).all():  # the sigma of the tape is not known

@@ -8,6 +8,8 @@ import shutil
 import threading
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,7 @@ import numpy as np
 import pytest
 
 from ipsys_log.engine import pieces, workers
+from ipsys_log.engine.output import append_messages
 from ipsys_log.engine.pieces import Piece, PieceFrames, PiecePlan, PieceRun
 from ipsys_log.engine.request import Request
 from ipsys_log.engine.workers import LocalWorkers
@@ -22,6 +25,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.live_runs.pipeline import replay
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.reader import LogReader
+from ipsys_log.messages import Message
 from tests.conftest import Ipsys
 from tests.publish.packs import write_points_log
 
@@ -72,6 +76,21 @@ def test_evaluations_of_several_models_have_the_same_bytes_for_any_number_of_pro
         replay([logs[-1]], MODELS, "evaluate", jobs=jobs)  # it is complete: no worker starts
     assert len(started) == 0 + 2 + 3
     assert len({log.read_bytes() for log in logs}) == 1
+
+
+def test_evaluation_does_not_use_what_a_worker_has_read_before_a_change(tmp_path: Path) -> None:
+    logs = [write_points_log(tmp_path / f"{jobs}.mcap") for jobs in (1, 2)]
+
+    def withdraw(log: Path, step: str, done: int, _total: int | None) -> None:
+        if (step, done) == ("models", 1):
+            with Session([log]) as session:
+                end_ns, first = session.end_ns, session.payloads(["/measurements"])[1]
+            gone = replace(first, timestamp=end_ns, id="w", withdraws=first.id, splits=())
+            append_messages(log, [Message("/measurements", end_ns + 1, end_ns, gone)])
+
+    for jobs, log in enumerate(logs, 1):
+        replay([log], MODELS, "evaluate", progress=partial(withdraw, log), jobs=jobs)
+    assert logs[0].read_bytes() == logs[1].read_bytes()
 
 
 def test_interrupt_keeps_the_models_that_are_evaluated(

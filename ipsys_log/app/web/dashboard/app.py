@@ -225,8 +225,9 @@ def dashboard_of_recording(
     seat : the seat of the device that operates, if another page has it, too.
     """
     cameras, now_ns = opened.cameras, opened.cameras.clock.now_ns
+    lab = opened.rig, opened.lenses, model, run
     setting = DashboardSetting(
-        opened.rig, opened.lenses, model, run, cameras.states, checks, log, now_ns, streams
+        *lab, cameras.states, checks, log, now_ns, streams, positions=cameras.positions
     )
     return Dashboard(setting, Operator(cameras.add, now_ns, cameras.say, seat))
 

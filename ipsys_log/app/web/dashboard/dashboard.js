@@ -7,7 +7,8 @@ import { showTiles } from "./tiles.js";
 const $ = (id) => document.getElementById(id);
 // Without data for this time, the page says so.
 const QUIET_MS = 3000;
-let map, operation, source, heard = 0, end = null, played = null;
+const KINDS = { live: "good", late: "bad", stale: "bad" };
+let map, operation, source, heard = 0, end = null, played = null, positions = null;
 
 function show(kind, text) {
   const chip = $("state");
@@ -20,8 +21,16 @@ function judge() {
   const quiet = performance.now() - heard;
   if (end === "ended") show("", played ? "playback ended" : "recording ended");
   else if (end === "failed") show("bad", "display failed: see the terminal");
-  else if (heard && quiet < QUIET_MS) show(played?.is_paused ? "" : "good", played ? playing(played) : "live");
+  else if (heard && quiet < QUIET_MS && played) show(played.is_paused ? "" : "good", playing(played));
+  else if (heard && quiet < QUIET_MS) show(KINDS[positions?.state] ?? "", positions?.summary ?? "no frame is processed yet");
   else if (heard) show("bad", `no data for ${Math.round(quiet / 1000)} s`);
+}
+
+// Why positions are late or stale, and what helps.
+function showCause() {
+  const text = end ? "" : [positions?.cause, positions?.remedy].filter(Boolean).join(". ");
+  if ($("cause").textContent !== text) $("cause").textContent = text;
+  $("cause").hidden = !text;
 }
 
 const playing = ({ is_paused, rate }) => (is_paused ? "paused" : rate === 1 ? "playing" : `playing × ${rate}`);
@@ -45,6 +54,8 @@ function connect() {
   listen("status", (data) => {
     end = data.end;
     played = data.playback ?? null;
+    positions = data.positions ?? null;
+    showCause();
     showStatus(data);
     operation.show(data);
     judge();

@@ -42,6 +42,7 @@ from ipsys_log.sinks.selection import PlayedScene
 from ipsys_log.sinks.streams.opening import Stream
 from ipsys_log.sinks.streams.poses import NewSession
 from ipsys_log.statistics.disagreement import OverlapSummary
+from ipsys_log.statistics.latency import PositionMonitor
 from ipsys_log.units import NS_PER_S
 
 _NS_PER_MS = 1_000_000
@@ -64,6 +65,7 @@ class DashboardSetting:
     now_ns : the clock of the log times.
     streams : the streams of positions.
     played : the playback of the log; None for a recording.
+    positions : the state of the positions of a recording.
     """
 
     rig: Rig | None
@@ -76,6 +78,7 @@ class DashboardSetting:
     now_ns: Callable[[], int]
     streams: Sequence[Stream] = ()
     played: PlayedLog | None = None
+    positions: PositionMonitor | None = None
 
 
 class Dashboard:
@@ -166,6 +169,7 @@ class Dashboard:
             "streams": describe_streams(self._setting.streams),
             **self._statistics(now_ns),
             "events": events,
+            **self._describe_positions(),
             **self._operation(now_ns),
         }
 
@@ -213,6 +217,11 @@ class Dashboard:
         if played is not None:
             return {"playback": played.describe()}
         return {"recording": describe_recording(self._setting.log, now_ns - self._begin_ns)}
+
+    def _describe_positions(self) -> dict[str, Any]:
+        """Return whether the positions are live, late or stale; nothing before the first frame."""
+        state = self._setting.positions and self._setting.positions.state
+        return {"positions": {**state._asdict(), "summary": state.summary}} if state else {}
 
     def _statistics(self, now_ns: int) -> dict[str, Any]:
         """Return latencies and disagreement of cameras, computed at most once per second."""

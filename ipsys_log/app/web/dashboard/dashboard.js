@@ -1,6 +1,6 @@
 // The dashboard. It shows the events of the server; only the server decides what a device may do.
 import { FloorMap } from "./map.js";
-import { Operation } from "./operate.js";
+import { Operation, PlayerBar } from "./operate.js";
 import { showRobots, showStatus } from "./panels.js";
 import { showTiles } from "./tiles.js";
 
@@ -8,7 +8,7 @@ const $ = (id) => document.getElementById(id);
 // Without data for this time, the page says so.
 const QUIET_MS = 3000;
 const KINDS = { live: "good", late: "bad", stale: "bad" };
-let map, operation, source, heard = 0, end = null, played = null, positions = null;
+let map, operation, player = null, source, heard = 0, end = null, played = null, positions = null;
 
 function show(kind, text) {
   const chip = $("state");
@@ -56,6 +56,7 @@ function connect() {
     played = data.playback ?? null;
     positions = data.positions ?? null;
     showCause();
+    player?.show(end ? null : played);
     showStatus(data);
     operation.show(data);
     judge();
@@ -93,6 +94,7 @@ async function begin() {
   }
   map = new FloorMap($("floor"), $("legend"), $("growth"), $("view"), scene);
   operation = new Operation(scene.may_operate);
+  if (scene.may_play) player = new PlayerBar((state) => { played = state; player.show(state); judge(); });
   reconnect();
   setInterval(judge, 500);
 }

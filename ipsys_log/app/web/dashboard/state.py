@@ -6,6 +6,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from ipsys_log.app.web.dashboard.status import (
 )
 from ipsys_log.capture.frames import CameraState
 from ipsys_log.capture.live_check import FrameCheck
+from ipsys_log.errors import IpsysError
 from ipsys_log.live_runs.player import Player
 from ipsys_log.log.contents import run_of_topic
 from ipsys_log.messages import (
@@ -48,6 +50,8 @@ from ipsys_log.units import NS_PER_S
 _NS_PER_MS = 1_000_000
 # Number of the last positions whose latencies count.
 _LATENCIES = 1000
+# After a seek in a pause, the page shows what came in this time: an image of each camera of 4 Hz or more.
+_LEAD_S = 0.5
 # Events that end and begin the state `up` of a camera.
 _UP_AFTER = {"camera_lost": False, "camera_back": True}
 
@@ -138,7 +142,14 @@ class Dashboard:
                 "trails": self._robots.trails(),
                 "may_operate": may_operate and self.operator is not None,
                 "played": self._setting.played is not None,
+                "may_play": may_operate and self._setting.played is not None,
             }
+
+    def control(self, body: Mapping[str, Any]) -> dict[str, Any]:
+        """Change the playback of the log as :meth:`PlayedLog.control`; a recording has none."""
+        if self._setting.played is None:
+            raise IpsysError("this page shows a recording; only the playback of a log can pause or move")
+        return self._setting.played.control(body)
 
     def robots(self) -> dict[str, Any]:
         """Return the newest poses; ``now`` is the time of the page in ms. A new session has new trails."""
@@ -225,10 +236,13 @@ class Dashboard:
 
     def _statistics(self, now_ns: int) -> dict[str, Any]:
         """Return latencies and disagreement of cameras, computed at most once per second."""
-        if self._computed is None or now_ns - self._computed[0] >= NS_PER_S:
+        before_ns = None if self._computed is None else self._computed[0]
+        # In a pause of a playback, the clock stands still.
+        if before_ns is None or now_ns == before_ns or now_ns - before_ns >= NS_PER_S:
             with self._lock:
                 latencies, overlap = list(self._latencies), self._overlap.lines()
             self._computed = now_ns, {"latency": describe_latencies(latencies), "overlap": overlap}
+        assert self._computed is not None
         return self._computed[1]
 
     def _operation(self, now_ns: int) -> dict[str, Any]:
@@ -287,6 +301,27 @@ class PlayedLog:
             "is_paused": player.is_paused,
             "loops": player.loop,
         }
+
+    def control(self, body: Mapping[str, Any]) -> dict[str, Any]:
+        """Pause or continue, move to a time, or change the rate; return the new state of the playback.
+
+        Raises
+        ------
+        IpsysError
+            A value is not a number, or the rate is outside its range.
+        """
+        player, numbers = self._player, {}
+        for name in body.keys() & {"seconds", "rate"}:
+            if type(body[name]) not in (int, float) or not isfinite(body[name]):
+                raise IpsysError(f"{name}: give a number")
+            numbers[name] = float(body[name])
+        if "rate" in numbers:
+            player.rate = numbers["rate"]
+        if "is_paused" in body:
+            (player.pause if body["is_paused"] is True else player.resume)()
+        if "seconds" in numbers:
+            player.seek(numbers["seconds"], _LEAD_S)
+        return self.describe()
 
     def picture_every_ns(self) -> int:
         """Return the shortest time between two pictures: each one in a pause, else five in a real second."""

@@ -23,6 +23,7 @@ from tests.cli.test_stream_command import started, stop
 from tests.conftest import Ipsys
 from tests.sinks.streaming import write_tracks
 from tests.test_bad_input import refused
+from tests.web.axe import serious_faults
 from tests.web.contrast import low_contrasts
 from tests.web.dashboards import page_of
 from tests.web.phone import Phone
@@ -206,6 +207,7 @@ def test_browser_plays_pauses_and_seeks(recorded: Path, browser: Phone, size: tu
         for scheme in ("light", "dark"):
             browser.prefer(scheme)
             assert low_contrasts(browser) == [], scheme
+        assert serious_faults(browser) == []
         player.stop()
         says(browser, "#state", "playback ended")
         browser.wait("document.querySelector('#player').hidden")

@@ -23,6 +23,7 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedImage, Message, Rig, RigCamera, image_topic
 from ipsys_log.units import NS_PER_S
 from tests.conftest import Ipsys, small_disk
+from tests.sinks.streaming import judged
 
 RIG = Rig("lab", "DICT_4X4_100", 0.2)
 Usage = namedtuple("Usage", "total used free")
@@ -170,6 +171,13 @@ def test_camera_that_delivers_fewer_frames_is_named(tmp_path: Path) -> None:
             "camera white delivers 2.7 of 10 frames/s: this computer draws its images too slowly; lower "
             "rate_hz in the rig",
         ]
+
+
+def test_display_shows_late_positions_with_their_cause(tmp_path: Path) -> None:
+    with CameraMonitor(RIG) as monitor:
+        status = LiveStatus({}, monitor, tmp_path / "a.mcap", lambda: 0.0, positions=judged("late"))
+        shown = [str(part) for part in status.show().renderables]
+        assert "positions are late: 0.4 s. The cause. The remedy" in shown
 
 
 def test_seconds_count_from_the_first_processed_frame(

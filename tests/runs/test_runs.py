@@ -41,7 +41,7 @@ def replayed_paper(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     def write(folder: Path) -> None:
         shutil.copy(PAPER, folder / "paper.mcap")
-        pipeline.replay([folder / "paper.mcap"], Request())
+        pipeline.replay([folder / "paper.mcap"], Request(models=("poly",)))
 
     return make_once(tmp_path_factory, "paper", write) / "paper.mcap"
 

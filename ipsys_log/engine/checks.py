@@ -123,7 +123,7 @@ def _check_new_stages(
     for stage in sorted(stages, key=is_of_model) if request.run is not None else ():
         name = request.run if has_given_name(stage, stages[-1]) else None
         if not new.intersection(stage.reads):
-            run = _current_run(session, request, models[0], stage, inputs, name)
+            run = _current_run(session, request, next(iter(models), ""), stage, inputs, name)
             if run is not None:
                 inputs.update({channel: run for channel in stage.writes if channel is not RUN_EVENTS})
                 continue

@@ -32,12 +32,13 @@ from ipsys_log.stages.detect import usual_corners
 class LivePlan(NamedTuple):
     """The plan of a live run.
 
-    It has the rig, the completed request, and the models of another log with the tasks that copy them. It
-    also has the runs in the order of their records, and the causal stages.
+    It has the rig, the completed request, the reason for its models, and the models of another log with the
+    tasks that copy them. It also has the runs in the order of their records, and the causal stages.
     """
 
     rig: Rig
     request: Request
+    reason: str
     copied: list[tuple[Task, Model]]
     runs: list[LiveRun]
     stages: list[WiredStage]
@@ -117,7 +118,8 @@ def plan_live(
     models = [model for _, model in copied]
     _check(rig, cameras, lenses, models, until)
     wired = _wire(pictured, settings, lenses, request, copied, until, imported_run(cameras))
-    return LivePlan(rig, request, copied, *wired)
+    reason = applied_models(request)[1] if copied else ""
+    return LivePlan(rig, request, reason, copied, *wired)
 
 
 def check_start(
@@ -148,9 +150,7 @@ def check_start(
     if not models:
         return []
     assert request.model_from is not None
-    reason = applied_models(request)[1]
-    lines = [*([reason] if reason else []), *compare_labs(request.model_from, rig, lenses)]
-    return lines + [
+    return compare_labs(request.model_from, rig, lenses) + [
         f"camera {name}: {request.model_from} has no model of this camera; it is recorded, but not used "
         "for tracking"
         for model in models

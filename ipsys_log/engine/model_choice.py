@@ -88,8 +88,8 @@ def applied_models(request: Request) -> tuple[tuple[str, ...], str]:
 def newest_model(session: Session) -> str:
     """Return the name of the model of the newest run of the user.
 
-    Several models that are only fitted and evaluated were not selected: ``evaluate`` fits all models. Of
-    these, it is the most accurate one.
+    Several models that are only fitted and evaluated were not selected: ``evaluate`` fits all models. Then it
+    is the most accurate one of them.
 
     Raises
     ------
@@ -118,7 +118,7 @@ def _best_possible(session: Session, given: Rig | None) -> tuple[tuple[str], str
 
 
 def _newest_chain(records: Sequence[Run]) -> list[Run]:
-    """Return the newest run that the user has selected by its model, and the runs that it has read."""
+    """Return the newest run that the user has selected by its model, the runs it has read, its evaluation."""
     applied = {run.run for run in records if _applies_model(run)}
     only_evaluated = {run.run for run in records if writes(run, EVALUATION)} - applied
     of_evaluation = only_evaluated if len(only_evaluated) > 1 else set()
@@ -126,7 +126,7 @@ def _newest_chain(records: Sequence[Run]) -> list[Run]:
         is_candidate = _applies_model(run) or (writes(run, MODEL) and run.run not in of_evaluation)
         chain = _chain(run, records) if is_candidate else []
         if any(writes(one, MODEL) and "model" in one.parameters for one in chain):
-            return chain
+            return chain + [one for one in records if one.run == run.run and writes(one, EVALUATION)][-1:]
     return []
 
 

@@ -222,6 +222,8 @@ def live(
         The first error of ``sinks``, after the log is complete: it cannot end the recording.
     """
     plan = plan_live(cameras.states, settings, request, until)
+    if plan.reason:
+        cameras.say(plan.reason)
     first = (*settings, *plan.copies(cameras.now_ns))
     knocks = knock_events(plan.rig, cameras.add_event)
     with (

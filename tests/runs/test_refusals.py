@@ -136,6 +136,7 @@ OTHER_CAMERAS = edit(
         model, cameras=tuple(replace(one, camera=f"{one.camera}_old") for one in model.cameras)
     ),
 )
+WIDE = np.array([[0.9, 1, 1], [1, 0.9, 1], [1, 1, 1]])
 MODEL_FROM = "replay LOG --model-from MODEL"
 A, B = Distance("A", 2.0), Distance("B", 2.0)
 
@@ -207,7 +208,7 @@ CASES: dict[str, Case] = {
     "other_cameras": Case(said="model is for the cameras", command=MODEL_FROM, change_model=OTHER_CAMERAS),
     "other_lenses": Case(
         said="this is a model of other cameras; calibrate this lab", command=MODEL_FROM,
-        change=lens_of(K=np.diag([500.0, 500.0, 1.0])),
+        change=edit(CameraCalibration, lambda lens: replace(lens, K=lens.K * WIDE)),
     ),
     "incomplete_model": Case(
         said="the stored model poly has no parameter", command=MODEL_FROM, change_model=NO_PARAMETERS

@@ -155,14 +155,14 @@ report = with_options({**_options, "html": _HTML}, "report", _REPORT)(_report)
 def export(
     logs: ReadLogs,
     output: Annotated[
-        Path,
+        Path | None,
         setting(
             "--output,-o",
             "FILE",
             "The file to write. Its suffix gives the format: .csv, .parquet (tables), .tum, .kitti "
             "(trajectories), .mcap (ROS 2 bag), .mp4 (video). For --format coco: a new folder.",
         ),
-    ],
+    ] = None,
     format_: Annotated[
         str | None,
         setting(
@@ -209,8 +209,11 @@ def export(
         ipsys export monday.mcap -o markers --format coco        # a new folder
     """
     from ipsys_log.api import python_api as api
-    from ipsys_log.api.log_export import find_format, parse_size
+    from ipsys_log.api.log_export import EXPORT_FORMATS, find_format, parse_size
 
+    if output is None:
+        formats = [f"-o NAME{row.suffix} ({row.text})" for row in EXPORT_FORMATS.values() if row.suffix]
+        raise IpsysError(f"-o is missing; use {', '.join(formats)}, or --format coco -o FOLDER")
     wanted = find_format(output, format_)
     if wanted.suffix is not None:
         check_file(output, "-o", logs)

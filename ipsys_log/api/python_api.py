@@ -178,7 +178,7 @@ def replay(
 
     Parameters
     ----------
-    model : a name of a model, such as ``best``, or several; none: ``poly``, or all for an evaluation.
+    model : a name of a model, such as ``best``, or several; none: as ``ipsys replay`` chooses.
     models : the old name of ``model``.
     until : the last stage, such as ``detect`` or ``evaluate``; None: all stages.
     rig, calibrations : they replace those of the log, as a new run; calibrations by camera.
@@ -454,7 +454,7 @@ def live(
     rig : the rig file, ``lab.toml``; the streams of its ``[stream]`` are opened.
     record : the new log; None: nothing is recorded.
     model_from : the log with the fitted models, a file or a URL.
-    model : a name of a model, or several; none: ``poly`` if there is one, else the newest.
+    model : a name of a model, or several; none: that of the newest run of the log.
     models : the old name of ``model``.
     cameras : only these cameras of the rig.
     calibrations : they replace the intrinsics that the rig names, by camera.

@@ -11,7 +11,6 @@ from typing import Any
 from ipsys_log.engine.provenance import Outcome, read_channels
 from ipsys_log.engine.request import Request, fitted_in
 from ipsys_log.engine.view import LogView
-from ipsys_log.errors import IpsysError
 from ipsys_log.log.contents import camera_of_topic, run_of_topic
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraCalibration, ChannelRead, Model, Rig, Run
@@ -178,13 +177,9 @@ def copy_model(request: Request, name: str) -> tuple[Task, Model]:
     Raises
     ------
     IpsysError
-        The other log has no such model, or none is given.
+        The other log has no such model.
     """
-    if request.model_from is None:
-        raise IpsysError(
-            "no fitted model is given; give the log of a calibration: --model-from LOG (in Python: "
-            "model_from). To fit its model: ipsys replay LOG"
-        )
+    assert request.model_from is not None
     with Session([request.model_from]) as other:
         model, topic = fitted_in(other, name)
         foreign = read_channels(other, [topic])

@@ -54,7 +54,7 @@ class Case:
 
     said: str
     change: Change = lambda message: message
-    command: str = "replay LOG"
+    command: str = "replay LOG --model poly"
     log: str = "paper"
     before: str = ""
     late: bool = False
@@ -208,6 +208,10 @@ CASES: dict[str, Case] = {
     "no_point": Case(said="has no calibration point 'p9'", command="exclude LOG p9"),
     "no_reason": Case(said="--reason: is missing", command="exclude LOG s001"),
     "other_cameras": Case(said="model is for the cameras", command=MODEL_FROM, change_model=OTHER_CAMERAS),
+    "other_lenses": Case(
+        said="this is a model of other cameras; calibrate this lab", command=MODEL_FROM,
+        change=lens_of(K=np.diag([500.0, 500.0, 1.0])),
+    ),
     "incomplete_model": Case(
         said="the stored model poly has no parameter", command=MODEL_FROM, change_model=NO_PARAMETERS
     ),
@@ -224,7 +228,7 @@ def model_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from ipsys_log.live_runs.pipeline import replay
 
     path = Path(shutil.copy(PAPER, tmp_path_factory.mktemp("model") / "model.mcap"))
-    replay([path], Request(), "fit")
+    replay([path], Request(models=("poly",)), "fit")
     return path
 
 

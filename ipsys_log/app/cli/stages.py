@@ -83,15 +83,16 @@ _UNTIL = option(
 _REPLAY = f"""
 Run the missing stages of a log, append their results to it, and print the accuracy.
 
-With --until locate, fuse or smooth and without --model, the command continues the newest run, with its model
-and settings. These are all stages in their order; smooth only runs with --until smooth:
+Without --model, the command continues the newest run, with its model and settings. If there is none, it fits
+joint to a log with markers and their heights, and best to any other log; a line says why. These are all
+stages in their order; smooth only runs with --until smooth:
 
 {_stage_lines()}
 
 Examples
 
-    ipsys replay calibration.mcap                      # fit and evaluate poly
-    ipsys replay calibration.mcap --model best --plot floor.png
+    ipsys replay calibration.mcap                      # fit and evaluate the best model
+    ipsys replay calibration.mcap --model poly --plot floor.png    # the method of the paper
     ipsys replay monday.mcap --model-from calibration.mcap
     ipsys replay calibration.mcap --rig lab.toml       # with a corrected rig
     ipsys replay monday.mcap --until detect            # only the markers

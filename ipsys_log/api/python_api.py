@@ -447,7 +447,7 @@ def live(
     force: bool = False,
     say: Callable[[str], None] = lambda text: None,
 ) -> Tracker:
-    """Track robots with the cameras of a rig file, and record everything if the user wants a log.
+    """Track robots with the cameras of a rig file; with ``record``, write everything into a log.
 
     Parameters
     ----------

@@ -182,6 +182,11 @@ def check_model(model: Model, cameras: Collection[str]) -> None:
 def _copied(request: Request, until: str | None) -> list[tuple[Task, Model]]:
     """Return the models of another log to apply, with the tasks that copy them in; none before locate."""
     reads_model = any(MODEL in stage.reads for stage in _causal(until))
+    if reads_model and request.model_from is None:
+        raise IpsysError(
+            "no fitted model is given; give the log of a calibration: --model-from LOG (in Python: "
+            "model_from). To fit its model: ipsys replay LOG"
+        )
     return [copy_model(request, name) for name in applied_models(request)[0]] if reads_model else []
 
 

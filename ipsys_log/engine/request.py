@@ -13,6 +13,7 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.log.location import LogLocation
 from ipsys_log.messages import CameraCalibration, Model, Rig
 from ipsys_log.messages.channels import MARKERS, MODEL, RIG
+from ipsys_log.models.table import is_known
 from ipsys_log.plain_text import shell_words
 from ipsys_log.stages import CORNERS, METHOD
 from ipsys_log.statistics.calibration_points import has_measurements
@@ -91,23 +92,26 @@ def has_corners(session: Session) -> bool:
 
 
 def fitted_in(other: Session, name: str | None) -> tuple[Model, str]:
-    """Return the newest model in another log, of the given name if there is one, and its topic.
+    """Return the newest model in another log, and its topic; of the given name, or of a run of this name.
 
     Raises
     ------
     IpsysError
         There is no such model.
     """
-    for topic in reversed(_model_topics(other)):
-        model: Model = other.payloads([topic])[-1]
-        if name in (None, model.name):
+    models: list[Model] = []
+    for topic in reversed(topics := _model_topics(other)):
+        models.append(other.payloads([topic])[-1])
+        if name in (None, models[-1].name):
+            return models[-1], topic
+    for model, topic in zip(models, reversed(topics), strict=True):
+        if name == run_of_topic(topic):
             return model, topic
-    wanted = f"model {name}" if name else "model"
-    option = f" --model {name}" if name else ""
-    raise IpsysError(
-        f"{other}: has no fitted {wanted}; to fit one: "
-        f"ipsys replay {shell_words(*other.paths)} --until fit{option}"
-    )
+    wanted, option = (f"model {name}", f" --model {name}") if name else ("model", "")
+    known = f" (it has: {', '.join(dict.fromkeys(model.name for model in models))})" if models else ""
+    fit = f"; to fit one: ipsys replay {shell_words(*other.paths)} --until fit{option}"
+    is_fittable = name is None or is_known(name)
+    raise IpsysError(f"{other}: has no fitted {wanted}{known}{fit if is_fittable else ''}")
 
 
 def _model_topics(session: Session) -> list[str]:

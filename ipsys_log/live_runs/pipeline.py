@@ -191,7 +191,7 @@ def measure(
 def live(
     cameras: CameraSource,
     settings: Sequence[Message],
-    target: Path,
+    target: Path | None,
     request: Request,
     until: str | None = None,
     sinks: Sequence[Sink] = (),
@@ -206,6 +206,7 @@ def live(
     ----------
     cameras : live cameras, or simulated ones with a simulated clock.
     settings : written first: rig and camera intrinsics.
+    target : the new log; None: nothing is recorded.
     request : corners, method and, for stages that read a model, ``model_from``.
     until : the last stage, such as detect or camera-frame; None: all causal stages.
     sinks : each gets every frame that the stages have processed, and their results, after the write.
@@ -236,12 +237,19 @@ def live(
         arriving, events = _begin(frames, resources), frames.take_events
         ledger = Ledger(cameras.clock.now_ns, cameras.received_ns)
         fault = _put_through(chain(settings, arriving), plan.stages, ledger, log, show, events)
-        if fault is not None:
+        if fault is not None and target is not None:
             cameras.add_event("stages_stopped", f"{fault}; the recording continues")
             for message in arriving:
                 show(*events(), message)
         show(*events())
     log.check_file()
+    if target is None:
+        if fault is not None:
+            raise fault
+        if frames.skipped:
+            cameras.say(f"{frames.skipped.total()} frames skipped: processing could not keep up")
+        show.check()
+        return [Outcome(one.stage.name, one.run, True) for one in plan.runs]
     if fault is not None:
         raise IpsysError(
             f"{fault}; {target} has all frames; to process them: ipsys replay {shell_words(target)}"

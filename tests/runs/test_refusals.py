@@ -205,6 +205,9 @@ CASES: dict[str, Case] = {
     # Models of other logs.
     "no_such_model": Case(said="has no fitted model best", command="fit LOG --model best --model-from MODEL"),
     "no_such_model_live": Case(said="has no fitted model best", command=f"{MODEL_FROM} --model best"),
+    "no_format": Case(said="-o NAME.mp4 (a video)", command="export LOG"),
+    "no_point": Case(said="has no calibration point 'p9'", command="exclude LOG p9"),
+    "no_reason": Case(said="--reason: is missing", command="exclude LOG s001"),
     "other_cameras": Case(said="model is for the cameras", command=MODEL_FROM, change_model=OTHER_CAMERAS),
     "other_lenses": Case(
         said="this is a model of other cameras; calibrate this lab", command=MODEL_FROM,

@@ -137,7 +137,9 @@ def exclude(
     points: Annotated[
         list[str], typer.Argument(metavar="POINT", help="Names of calibration points, such as p007.")
     ],
-    reason: Annotated[str, setting("--reason", "TEXT", "The reason, which is written into the log.")],
+    reason: Annotated[
+        str, setting("--reason", "TEXT", "The reason, which is written into the log. Necessary.")
+    ] = "",
     readmit: Annotated[
         bool, switch("--readmit", "Use excluded points again, instead of excluding points.")
     ] = False,

@@ -185,7 +185,7 @@ def _copied(request: Request, until: str | None) -> list[tuple[Task, Model]]:
     if reads_model and request.model_from is None:
         raise IpsysError(
             "no fitted model is given; give the log of a calibration: --model-from LOG (in Python: "
-            "model_from). To fit its model: ipsys replay LOG"
+            "model_from). To fit one: ipsys calibrate-lab LOG"
         )
     return [copy_model(request, name) for name in applied_models(request)[0]] if reads_model else []
 

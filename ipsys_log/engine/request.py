@@ -28,8 +28,7 @@ class Request:
 
     Attributes
     ----------
-    models : names in the table of models; empty: ``poly``, or the model of ``model_from``; for an evaluation,
-        all models.
+    models : names in the table of models; empty: see :func:`ipsys_log.engine.model_choice.choose_models`.
     rig, lenses : used instead of those of the log, as a new run. Camera intrinsics by camera.
     model_from : another log; its newest fitted model is applied and copied into the log.
     model_run : a run of the log whose model was copied from another log; it is applied again.

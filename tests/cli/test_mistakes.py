@@ -40,7 +40,7 @@ MISTAKES = {
         "live --rig lab.toml -o a.mcap --model-from lab.mcap", "has no fitted model", "ipsys replay lab.mcap"
     ),
     "board": Mistake("calibrate lab.mcap --board 5x", "--board 5x: is not a board", "as 6x4"),
-    "point": Mistake("exclude lab.mcap p999", "p999", "ipsys info"),
+    "point": Mistake("exclude lab.mcap p999", "has no calibration point 'p999'", "it has s000"),
     # Files that would be lost.
     "new_log": Mistake("record --rig lab.toml -o lab.mcap", "exists already", "another name, or --force"),
     "new_rig": Mistake("init lab.toml", "lab.toml: exists already", "edit it, or give another name"),

@@ -17,6 +17,8 @@ from ipsys_log.units import NS_PER_S
 # above the noise of plain sub-pixel corners (about 1 mm across and 5 mm along the view at 2 m).
 STILL_ACROSS_M = 0.01
 STILL_ALONG_M = 0.04
+# The number of calibration points for errors of millimetres with a drive, and of a centimetre without one.
+ENOUGH_POINTS = "4 with a drive, or 15 for each camera with the tape alone"
 # In a longer gap of the sightings, the marker may have moved.
 LONGEST_GAP_NS = 2 * NS_PER_S
 _FARTHEST_M = 10_000.0

@@ -30,6 +30,14 @@ def test_a_sample_log_gives_centimetres(ipsys: Ipsys, tmp_path: Path, name: str)
     assert model["tracks"]["truth"]["3d"]["mean_m"] < 0.006
 
 
+def test_sample_with_a_drive_is_calibrated_to_millimetres(ipsys: Ipsys, tmp_path: Path) -> None:
+    log = Path(shutil.copy(SAMPLES / "drive_lab.mcap", tmp_path))
+    done = ipsys("calibrate-lab", log)
+    assert done.out.startswith("Enough: "), done.err
+    tracks = json.loads(ipsys("replay", log, "--json").out)["models"]["joint"]["tracks"]["truth"]["2d"]
+    assert tracks["mean_m"] < 0.003
+
+
 def test_the_samples_are_small() -> None:
     assert sum(path.stat().st_size for path in SAMPLES.glob("*.mcap")) < 15e6
     described = (SAMPLES / "README.md").read_text()

@@ -250,4 +250,6 @@ def _print(folder: LabFolder, name: str, typed: Mapping[str, str]) -> bytes:
         prints = [board_print(entry.parse(), entry.board)]
     else:
         raise IpsysError(f"the print {name!r} is not known; reload this page")
-    return draw_pages(lay_out(prints, choose_paper(prints, None)))
+    # A4 means the usual choice: A3 if A4 is too small.
+    paper = typed.get("paper", "A4")
+    return draw_pages(lay_out(prints, choose_paper(prints, None if paper == "A4" else paper)))

@@ -4,7 +4,7 @@ import { make } from "./make.js";
 import { alignedImage, cameraImage, floorSketch } from "./pictures.js";
 
 // More cards than these are compact, so that a page of them can be surveyed.
-const MOST_LARGE = 6;
+const MOST_LARGE = 6, MOST_HEIGHTS = 30;
 const cards = (made) => make("div", { className: `cards${made.length > MOST_LARGE ? " many" : ""}` }, ...made);
 
 const cameraId = (key) => `camera-${key.replace(/[^a-z0-9]/gi, (sign) => `_${sign.charCodeAt(0)}`)}`;
@@ -71,13 +71,14 @@ function lines(rows) {
   return rows.length ? [make("ul", { className: "lines" }, ...rows.map(([kind, text]) => make("li", { className: kind, textContent: text })))] : [];
 }
 
-// A button that downloads a PDF for a printer; texts: the typed fields.
+// A button that downloads a PDF for a printer, and the paper; texts: the typed fields.
 function printer(name, text, act, texts = () => ({})) {
-  return button(text, () => act(async () => {
-    const answer = await fetch(`print/${name}.pdf?${new URLSearchParams(texts())}`);
+  const paper = make("select", { id: `paper-${name}`, ariaLabel: "Paper" }, ...["A4", "Letter", "A3"].map((one) => make("option", {}, one)));
+  return [button(text, () => act(async () => {
+    const answer = await fetch(`print/${name}.pdf?${new URLSearchParams({ ...texts(), paper: paper.value })}`);
     if (!answer.ok) throw new Error((await answer.json()).error);
     make("a", { href: URL.createObjectURL(await answer.blob()), download: `${name}.pdf` }).click();
-  }), `print-${name}`);
+  }), `print-${name}`), paper];
 }
 
 function submit(form, state, act, isMain, work, { id = "save", text = "Save", disabled = false } = {}) {
@@ -90,32 +91,44 @@ function submit(form, state, act, isMain, work, { id = "save", text = "Save", di
 function rig(state, act, step) {
   const { values, labels, dictionaries, exists, name } = state.rig;
   if (exists && name === null) return lines([["bad", "Correct lab.toml with a text editor; this page sees the new file. Or move it away to begin again."]]);
-  const form = make("form", { className: "grid" });
+  const form = make("form", { className: "grid" }), heights = make("div", { id: "heights", className: "grid" });
   let pair = form;
   for (const [key, label] of Object.entries(labels)) {
-    const made = field(key, label, values[key], key.endsWith("_m") ? { inputMode: "decimal" } : {});
+    const offered = [...new Set([...dictionaries, values[key]])];
+    const made = key === "dictionary" ? choice(key, label, values[key], offered)
+      : field(key, label, values[key], key.endsWith("_m") ? { inputMode: "decimal" } : {});
     // The two coordinates of a point are side by side.
     if (/(width|x)_m$/.test(key)) form.append((pair = make("div", { className: "pair" }, made)));
     else if (/(depth|y)_m$/.test(key)) pair.append(made);
     else form.append(made);
-    if (key !== "dictionary") continue;
-    made.querySelector("input").setAttribute("list", "dictionaries");
-    made.append(make("datalist", { id: "dictionaries" }, ...dictionaries.map((name) => make("option", { value: name }))));
+    if (key === "point_marker") form.append(make("details", { className: "single" }, make("summary", { textContent: "Markers at other heights" }), heights));
   }
+  const input = (key) => form.querySelector(`#${key}`), number = (key) => Number((input(key)?.value ?? "").replace(",", "."));
+  // One height for each typed id; a height that is there stays.
+  const offerHeights = () => {
+    const ids = [...new Set(input("robots").value.match(/\d{1,4}/g) ?? [])].slice(0, MOST_HEIGHTS).map(Number);
+    heights.replaceChildren(...ids.map((id) => input(`height_${id}`)?.parentElement
+      ?? field(`height_${id}`, `Height of marker ${id}, in m`, values[`height_${id}`] ?? "", { inputMode: "decimal" })));
+  };
+  offerHeights();
   submit(form, state, act, step.status !== "done", async () => {
-    const typed = Object.fromEntries(Object.keys(labels).map((key) => [key, document.getElementById(key).value]));
+    const typed = Object.fromEntries([...form.querySelectorAll("input, select")].map((one) => [one.id, one.value]));
     showFaults(form, await change("rig", { values: typed }), (key) => key);
   });
-  const sketch = make("div", { id: "sketch" }), show = () => {
-    const numbers = Object.fromEntries(Object.keys(labels).map((key) => [key, Number((form.querySelector(`#${key}`)?.value ?? "").replace(",", "."))]));
-    sketch.replaceChildren(...floorSketch(numbers));
+  const sketch = make("div", { id: "sketch" }), show = ({ target } = {}) => {
+    if (target === input("robots")) offerHeights();
+    const apart = Math.hypot(number("second_x_m") - number("first_x_m"), number("second_y_m") - number("first_y_m"));
+    // Coordinates give the distance AB; a typed distance moves B.
+    if (target && /_[xy]_m$/.test(target.id) && apart) input("ab_m").value = String(Number(apart.toFixed(4)));
+    sketch.replaceChildren(...floorSketch(Object.fromEntries(Object.keys(labels).map((key) => [key, number(key)]))));
   };
   form.addEventListener("input", show);
   show();
   const help = [make("div", { className: "help" }, make("div", {},
     make("p", { textContent: "Measure the side of the black square of a printed marker, without its white margin. With an error of 2 % in it, all heights have an error of 2 %." }),
-    make("p", { textContent: "The reference points A and B are two points on the floor that you can find again. You measure from them with a tape later: choose them some metres apart. x is to the right, y away from you." })), sketch)];
-  if (exists) return [...help, form, ...lines(state.rig.warnings.map((text) => ["warn", sentence(text)])), make("div", { className: "actions" }, printer("markers", "Markers to print (PDF)", act))];
+    make("p", { textContent: "The reference points A and B are two points on the floor that you can find again. You measure from them with a tape later: choose them some metres apart. x is to the right, y away from you. The distance from A to B, read with the tape, moves B." }),
+    make("p", { textContent: "Measure the height of the robots' markers with a ruler: the calibration with a drive needs it." })), sketch)];
+  if (exists) return [...help, form, ...lines(state.rig.warnings.map((text) => ["warn", sentence(text)])), make("div", { className: "actions" }, ...printer("markers", "Markers to print (PDF)", act))];
   const simulated = button("Use the simulated lab", () => act(() => change("simulate")), "simulate", { disabled: !state.may_change });
   return [
     make("h3", { textContent: "Without cameras" }),
@@ -204,7 +217,7 @@ function intrinsics(state, act) {
     ...shown,
     make("p", { textContent: "The intrinsics describe the lens of a camera. Pictures of a chessboard determine them." }),
     make("p", { textContent: "Print the chessboard, and glue it on a flat plate. Press Calibrate, move the board through the whole image, and tilt it to all sides. Pictures are taken by themselves. Stop ends early and calibrates with the pictures so far. A board of 7 x 5 squares has 6x4 inner corners." }),
-    make("div", { className: "actions" }, printer("board", "Board to print (PDF)", act, typed)),
+    make("div", { className: "actions" }, ...printer("board", "Board to print (PDF)", act, typed)),
     form,
     ...(state.board ? [] : [listed]),
     ...lines(report(state).map((text, n) => [n ? "" : "strong", text])),

@@ -22,6 +22,11 @@ LONGEST_GAP_NS = 2 * NS_PER_S
 _FARTHEST_M = 10_000.0
 # Heights with smaller differences are equal: the accuracy of a ruler and of uneven boards.
 _ONE_HEIGHT_M = 0.005
+# Enough calibration points: for all cameras together after a drive, where a fourth point shows a wrong one;
+# for each camera with the tape alone, where a polynomial of 10 terms needs some more.
+ENOUGH_POINTS = 4
+ENOUGH_TAPE_POINTS = 15
+ENOUGH_TEXT = f"{ENOUGH_POINTS} with a drive; {ENOUGH_TAPE_POINTS} for each camera with the tape alone"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

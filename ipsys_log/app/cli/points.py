@@ -47,9 +47,6 @@ Baseline = Annotated[
     ),
 ]
 
-# The model that a replay fits, and the number of calibration points that gives good results.
-_MODEL, _GOOD = "poly", 40
-
 
 @runs_until_stopped
 def measure(
@@ -178,8 +175,11 @@ def show_measured(
     log: Path, added: Sequence[Measurement], history: Sequence[Measurement], as_json: bool
 ) -> None:
     """Print the number of added measurements, and the next step for the points that a log has now."""
-    from ipsys_log.models.table import min_pairs
-    from ipsys_log.statistics.calibration_points import active_measurements
+    from ipsys_log.statistics.calibration_points import (
+        ENOUGH_TAPE_POINTS,
+        ENOUGH_TEXT,
+        active_measurements,
+    )
 
     withdrawn = sum(measurement.withdraws is not None for measurement in added)
     count = sum(measurement.is_point for measurement in added)
@@ -191,11 +191,8 @@ def show_measured(
         also += f", {withdrawn} withdrawn" if withdrawn else ""
         console.print(f"{counted(count, 'point')} measured into {log}{also}")
     active = len(active_measurements(history))
-    if 0 < active < _GOOD:
-        say(
-            f"calibration points in the log: {active}; each camera must see {min_pairs(_MODEL)} or more for "
-            f"a model, and about {_GOOD} for a good one"
-        )
+    if 0 < active < ENOUGH_TAPE_POINTS:
+        say(f"calibration points in the log: {active}; enough are {ENOUGH_TEXT}")
     if active:
         say(f"next: ipsys replay {shell_words(log)}")
 

@@ -1,7 +1,7 @@
 // The content of each step. The server decides what can be done; the page only asks.
 import { change, choice, field, markFault, showFaults } from "./fields.js";
 import { make } from "./make.js";
-import { alignedImage, cameraImage, floorSketch } from "./pictures.js";
+import { alignedImage, cameraImage, floorMap, floorSketch } from "./pictures.js";
 
 // More cards than these are compact, so that a page of them can be surveyed.
 const MOST_LARGE = 6, MOST_HEIGHTS = 30;
@@ -19,7 +19,8 @@ function report(state) {
 export function shownPart(name, state) {
   const parts = {
     rig: state.rig, cameras: [state.cameras, state.address], intrinsics: [state.intrinsics, state.board !== null, report(state)], alignment: state.alignment,
-    points: [state.points, state.measured_now], accuracy: [state.accuracy, state.points], live: state.tracked,
+    drive: [state.drive.logs, state.drive.views !== null], points: [state.points, state.map, state.measured_now],
+    accuracy: [state.accuracy, state.lab, state.map, state.points], live: state.tracked,
   };
   const busy = state.job && !state.job.ended ? state.job.action : null;
   return JSON.stringify([name, parts[name], state.steps, busy, state.pages, state.may_change, state.faults]);
@@ -28,7 +29,7 @@ export function shownPart(name, state) {
 export function panel(name, state, act) {
   const step = state.steps.find((one) => one.name === name);
   const number = state.steps.indexOf(step) + 1, later = state.steps.slice(number);
-  const content = { rig, cameras, intrinsics, alignment, points, accuracy, live }[name](state, act, step);
+  const content = { rig, cameras, intrinsics, alignment, drive, points, accuracy, live }[name](state, act, step);
   // Finished steps are skipped: a simulated lab has its cameras and their intrinsics.
   const following = later.find((one) => one.status === "ready") ?? later[0];
   const onward = step.status === "done" && following
@@ -255,23 +256,50 @@ const finish = (text, state, act) => button(text, () => act(() => change("stop")
 
 const opener = (id, page, text) => make("a", { id, className: "button main", href: `${page}/`, target: "_blank", textContent: text });
 
-function points(state, act) {
-  const { sheet, logs } = state.points;
-  const count = state.measured_now;
+const count = (number, noun) => `${number} ${noun}${number === 1 ? "" : "s"}`;
+
+function table(rows, heads = []) {
+  const cells = (row, kind) => make("tr", {}, ...row.map((text) => make(kind, {}, text)));
+  return make("div", { className: "wide" }, make("table", {}, make("thead", {}, ...(heads.length ? [cells(heads, "th")] : [])), make("tbody", {}, ...rows.map((row) => cells(row, "td")))));
+}
+
+function drive(state, act, step) {
+  const { views, logs } = state.drive;
   const parts = [
-    paragraph("Put a marker of a robot on the floor. Measure its distances from the two reference points with a tape, and type them on the measuring page. Repeat this over the whole floor, also near its edges; put the marker on a box for some points."),
-    paragraph("15 to 20 points in the view of each camera give good results."),
+    paragraph("Drive a robot, or carry its marker at its height, through all images for two minutes: in curves, through the overlaps, out to the edges. The drive replaces most work with the tape."),
+    make("div", { className: "actions" }, views ? finish("Finish the drive", state, act) : starter(logs.length ? "Drive again" : "Start the drive", "drive", state, act, step.status !== "done")),
+  ];
+  if (views) parts.push(make("p", { id: "drive-seconds" }), make("div", { id: "drive-views", className: "cards" }));
+  if (logs.length) parts.push(table(logs.map(([name, seconds]) => [make("code", { textContent: name }), `${seconds} s`])));
+  parts.push(make("details", {}, make("summary", { textContent: "Without a drive: the tape alone" }),
+    paragraph(`Skip this step, and measure more points: enough are ${state.points.enough}.`)));
+  return parts;
+}
+
+function points(state, act, step) {
+  const { sheet, logs, enough } = state.points;
+  const now = state.measured_now, isFirst = step.status !== "done";
+  const parts = [
+    paragraph(`Put a marker that no robot carries on the floor, near a numbered place of the map. Measure its distances from A and B with a tape, and type them on the measuring page. Enough are ${enough}; eight points after a drive are better.`),
   ];
   const actions = make("div", { className: "actions" });
   if (state.pages.measure) actions.append(opener("open-measure", "measure", "Open the measuring page"), finish("Finish measuring", state, act));
-  else actions.append(starter("Start measuring", "measure", state, act, !sheet && logs.length === 0));
-  if (sheet && !state.pages.measure) actions.append(starter(`Use the tape measurements in ${sheet}`, "sheet", state, act, logs.length === 0));
+  else {
+    if (sheet) actions.append(starter("Measure four points with the simulated tape", "sheet", state, act, isFirst));
+    actions.append(starter("Start measuring", "measure", state, act, isFirst && !sheet));
+  }
   parts.push(actions);
-  if (count !== null) parts.push(paragraph(`${count} ${count === 1 ? "point" : "points"} measured in this log so far.`));
+  if (now !== null) parts.push(paragraph(`${count(now, "point")} measured in this log so far.`));
+  if (state.map) parts.push(floorMap(state.map, null));
   if (logs.length) {
-    parts.push(make("table", {}, make("tbody", {}, ...logs.map(([name, number]) =>
-      make("tr", {}, make("td", {}, make("code", { textContent: name })), make("td", { textContent: `${number} points` }))))));
-    parts.push(paragraph("The fit uses all these logs. Measuring again writes a new log."));
+    const cameras = [...new Set(logs.flatMap(([, , seen]) => Object.keys(seen)))].sort();
+    parts.push(table(logs.map(([name, number, seen]) => [make("code", { textContent: name }), String(number), ...cameras.map((camera) => String(seen[camera] ?? "-"))]),
+      ["log", "points", ...cameras]));
+    parts.push(paragraph("The calibration uses all these logs. Measuring again writes a new log."));
+  }
+  if (sheet && !state.pages.measure) {
+    parts.push(make("details", {}, make("summary", { textContent: "Without a drive: the tape alone" }),
+      make("div", { className: "actions" }, starter(`Measure all points in ${sheet}`, "sheet-all", state, act, false))));
   }
   return parts;
 }
@@ -284,21 +312,37 @@ function outlier(one, several, state, act) {
   return make("li", { className: "warn outlier" }, make("span", { textContent: `${name}, error ${one.error_cm.toFixed(1)} cm: ${text}.` }), exclude);
 }
 
+// The answer of a calibration with a drive: is it enough, and what to add.
+function lab(state) {
+  const { headline: [answer, ...faults], enough, advice, title, columns, rows, gap, notes } = state.lab;
+  const leads = [["drive", "Drive there"], ["points", "Measure points"]];
+  return [
+    ...lines([[enough ? "good" : "warn", answer], ...faults.map((text) => ["warn", text.trim()]), ...advice.map((text) => ["", text])]),
+    ...(enough ? [] : [make("div", { className: "actions" }, ...leads.map(([name, text]) => button(text, () => { location.hash = name; }, `to-${name}`)))]),
+    ...(state.map ? [floorMap(state.map, gap)] : []),
+    make("details", {}, make("summary", { textContent: "Details of each camera" }), paragraph(sentence(title)), table(rows, columns), ...lines(notes.map((text) => ["", text]))),
+  ];
+}
+
 function accuracy(state, act, step) {
   const fit = state.accuracy;
   const parts = [
-    paragraph("The fit computes a model from the measured points: positions in the images become positions on the floor. Then it tells the error of the positions."),
-    make("div", { className: "actions" }, starter(fit ? "Fit again" : "Fit and evaluate", "replay", state, act, step.status !== "done")),
+    paragraph(state.drive.logs.length
+      ? "The calibration computes all cameras together, from the drive and the points. It tells the expected error over the floor, and whether it is enough."
+      : "Without a drive, the model of each camera comes from its points alone."),
+    make("div", { className: "actions" }, starter(fit ? "Calibrate again" : "Calibrate", "calibrate-lab", state, act, step.status !== "done")),
   ];
+  if (state.lab) parts.push(...lab(state));
+  else if (fit && !fit.figure) parts.push(paragraph("Calibrate again to see the expected errors."));
   if (!fit) return parts;
   if (fit.figure) parts.push(make("p", { className: "figure", textContent: fit.figure }));
   if (fit.outliers.length) {
     const several = new Set(state.points.logs.map(([name]) => name)).size > 1;
     parts.push(make("h3", { textContent: fit.outliers.length === 1 ? "A point contradicts the others" : `${fit.outliers.length} points contradict the others` }),
-      paragraph("Measure it again in step 5, and exclude it here. An excluded point stays in the log."),
+      paragraph("Measure it again, and exclude it here. An excluded point stays in the log."),
       make("ul", { className: "lines" }, ...fit.outliers.map((one) => outlier(one, several, state, act))));
   }
-  parts.push(make("details", {}, make("summary", { textContent: "Details" }), ...lines(fit.answer.map((text) => ["", text]))));
+  if (fit.answer.length) parts.push(make("details", {}, make("summary", { textContent: "Details" }), ...lines(fit.answer.map((text) => ["", text]))));
   return parts;
 }
 

@@ -2,7 +2,7 @@
 import { change, seat } from "./fields.js";
 import { make } from "./make.js";
 import { panel, shownPart } from "./panels.js";
-import { boardImage } from "./pictures.js";
+import { boardImage, driveImages } from "./pictures.js";
 
 const $ = (id) => document.getElementById(id);
 const EVERY_MS = 1000, PATIENCE_MS = 15000;
@@ -149,6 +149,11 @@ async function read() {
     $("folder").textContent = state.rig.name ?? state.folder;
     choose();
     drawPanel(isBack);
+    if (state.drive.views && $("drive-views")) {
+      $("drive-views").replaceChildren(...driveImages(state.drive.views));
+      $("drive-views").dataset.seconds = state.drive.seconds;
+      $("drive-seconds").textContent = `${state.drive.seconds} s recorded. Green: a robot was in this part of the image.`;
+    }
     if (state.board) $("board-image")?.replaceChildren(...boardImage(state.board));
     drawJob();
   } catch (error) {

@@ -144,7 +144,7 @@ def test_empty_folder_becomes_a_lab_with_tracked_robots(browser: Phone, folder: 
         browser.wait("document.querySelectorAll('.shaft').length >= 3")
         visitor.tap("#onward")
         visitor.tap("#drive")
-        visitor.wait("document.querySelectorAll('.covered').length > 20")
+        visitor.wait("document.querySelectorAll('.covered').length > 10")
         visitor.wait(f"document.querySelector('#drive-views').dataset.seconds >= {DRIVE_S}")
         visitor.tap("#finish")
         visitor.wait(f"document.querySelector('#onward') && {JOB_ENDED}")

@@ -74,7 +74,7 @@ def rig_prints(rig: Rig, ids: Sequence[int] | None = None, length_m: float | Non
     """
     names = {marker.id: marker.robot for marker in rig.markers}
     names |= {marker.id: "reference" for marker in rig.reference_markers}
-    if ids is None and is_simulated(rig):
+    if ids is None and rig.is_simulated:
         ids = [marker.id for marker in rig.markers if marker.robot]
         length_m = length_m or min(rig.marker_length_m, _USUAL_LENGTH_M)
     prints = []
@@ -82,11 +82,6 @@ def rig_prints(rig: Rig, ids: Sequence[int] | None = None, length_m: float | Non
         side_m = length_m or rig.length_of(marker_id)
         prints.append(marker_print(rig.dictionary, marker_id, side_m, names.get(marker_id)))
     return prints
-
-
-def is_simulated(rig: Rig) -> bool:
-    """Return whether all cameras of a rig are simulated."""
-    return bool(rig.cameras) and all(str(camera.source).startswith("sim:") for camera in rig.cameras)
 
 
 def board_print(board: Board, text: str) -> Print:

@@ -57,7 +57,12 @@ const sentence = (text) => `${text}.`.replace(/\.\.$/, ".");
 
 function button(text, work, id, more = {}) {
   const made = make("button", { type: "button", textContent: text, ...(id ? { id } : {}), ...more });
-  made.addEventListener("click", work);
+  // A second tap does nothing while the server works on the first one.
+  made.addEventListener("click", async () => {
+    if (made.ariaBusy === "true") return;
+    made.ariaBusy = "true";
+    try { await work(); } finally { made.ariaBusy = "false"; }
+  });
   return made;
 }
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from ipsys_log.app.first_day import work
 from ipsys_log.app.first_day.alignment import AlignmentResult
-from ipsys_log.app.first_day.board import BOARD_FIELDS, BoardSearch, parse_board_entry
+from ipsys_log.app.first_day.board import BOARD_FIELDS, DICTIONARIES, BoardSearch, parse_board_entry
 from ipsys_log.app.first_day.camera_choice import parse_camera_address, save_cameras, set_calibration
 from ipsys_log.app.first_day.camera_pictures import CameraPictures
 from ipsys_log.app.first_day.drive import DriveCoverage
@@ -30,12 +30,6 @@ from ipsys_log.live_runs.survey.live import LiveScene
 from ipsys_log.messages.rig_file import load_rig
 from ipsys_log.sinks.sink import Sink
 from ipsys_log.statistics.calibration_points import ENOUGH_POINTS, ENOUGH_TEXT
-
-# The dictionaries that the page offers first; the field takes any other name of OpenCV, too.
-DICTIONARIES = (
-    *("DICT_4X4_50", "DICT_4X4_100", "DICT_4X4_250", "DICT_5X5_100", "DICT_6X6_250"),
-    *("DICT_APRILTAG_25h9", "DICT_APRILTAG_36h11"),
-)
 
 
 class Pages(NamedTuple):

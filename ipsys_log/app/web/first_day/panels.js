@@ -265,7 +265,7 @@ const count = (number, noun) => `${number} ${noun}${number === 1 ? "" : "s"}`;
 
 function table(rows, heads = []) {
   const cells = (row, kind) => make("tr", {}, ...row.map((text) => make(kind, {}, text)));
-  return make("div", { className: "wide" }, make("table", {}, make("thead", {}, ...(heads.length ? [cells(heads, "th")] : [])), make("tbody", {}, ...rows.map((row) => cells(row, "td")))));
+  return make("div", { className: "wide", tabIndex: 0 }, make("table", {}, make("thead", {}, ...(heads.length ? [cells(heads, "th")] : [])), make("tbody", {}, ...rows.map((row) => cells(row, "td")))));
 }
 
 function drive(state, act, step) {
@@ -353,7 +353,7 @@ function accuracy(state, act, step) {
 
 function live(state, act, step) {
   const parts = [
-    paragraph("The robots are tracked and recorded. The dashboard shows them; other devices can open it, too, if ipsys setup was started with --host 0.0.0.0."),
+    make("p", {}, "The robots are tracked and recorded. The dashboard shows them. Other devices can open it, too, after ", command("ipsys setup --host 0.0.0.0")),
     make("div", { className: "actions" }, ...(state.pages.live
       ? [opener("open-live", "live", "Open the dashboard"), finish("Finish the recording", state, act)]
       : [starter("Start the live view", "live", state, act, step.status !== "done")])),

@@ -45,20 +45,20 @@ LABELS = {
 }
 _NUMBERS = [key for key in LABELS if key.endswith("_m")]
 # An empty field of these has no value.
-_OPTIONAL = ("marker_height_m", "point_marker", "ab_m")
+_OPTIONAL = re.compile(r"marker_height_m|point_marker|ab_m|height_\d{1,4}")
 _HEIGHT = re.compile(r"height_(\d{1,4})")
 
 
 def example_rig() -> Rig:
     """Return the rig of the example that ``ipsys init`` writes."""
-    return _in_memory(example_toml())
+    with TemporaryDirectory(prefix="ipsys-") as folder:
+        path = Path(folder) / _FILE
+        path.write_text(example_toml(), encoding="utf-8")
+        return load_rig(path)
 
 
 def rig_fields(rig: Rig) -> dict[str, str]:
-    """Return the text of each field for a rig; a missing value is an empty text.
-
-    The field ``height_0`` has the height of marker 0, if the rig has one for it alone.
-    """
+    """Return the text of each field for a rig, ``height_0`` for marker 0 alone; "" for a missing value."""
     first, second = (*rig.reference_points[:2], *_USUAL[len(rig.reference_points) :])
     values: dict[str, Any] = {
         "name": rig.name,
@@ -102,22 +102,17 @@ def check_rig_entry(typed: Mapping[str, str], rig: Rig) -> tuple[Rig | None, lis
             _check_alone(key, values[key], values.get("dictionary", rig.dictionary))
         except IpsysError as error:
             faults.append(Fault(key, _without_key(str(error))))
-    # The valid fields are checked together, beside the present values of the others: one answer names all
-    # faults.
+    # The valid fields are checked together, beside the present values: one answer names all faults.
     wrong = {fault.field for fault in faults}
     kept = {
         key: _value(key, text)
         for key, text in present.items()
-        if key in wrong and (text or _is_optional(key))
+        if key in wrong and (text or _OPTIONAL.fullmatch(key))
     }
     new = None if wrong - set(kept) else _build({**values, **kept}, rig)
     if new is not None:
         faults += [fault for fault in _check_together(new, values) if fault.field not in wrong]
     return (None, faults) if faults else (new, [])
-
-
-def _is_optional(key: str) -> bool:
-    return key in _OPTIONAL or _HEIGHT.fullmatch(key) is not None
 
 
 def _check_together(rig: Rig, values: Mapping[str, Any]) -> list[Fault]:
@@ -193,20 +188,11 @@ def save_rig_entry(path: Path, typed: Mapping[str, str]) -> list[Fault]:
     return []
 
 
-def _in_memory(text: str) -> Rig:
-    from tempfile import TemporaryDirectory
-
-    with TemporaryDirectory(prefix="ipsys-") as folder:
-        path = Path(folder) / _FILE
-        path.write_text(text, encoding="utf-8")
-        return load_rig(path)
-
-
 def _value(key: str, text: str) -> Any:
     """Return the value of a field; an empty text, or one that is no number, is an error."""
     if key == "robots":
         return [_marker_id(part) for part in re.split(r"[,;\s]+", text) if part]
-    if not text and _is_optional(key):
+    if not text and _OPTIONAL.fullmatch(key):
         return None
     if key == "point_marker":
         return _marker_id(text)

@@ -99,7 +99,7 @@ def _smooth(trial: Trial) -> Outcome:
 def _plots(trial: Trial) -> Outcome:
     """Draw the figures of a log with ground truth."""
     log = Path(shutil.copy(_SAMPLE, trial.folder))
-    answer = trial.ipsys("replay", log.name, "--plots", "figures")
+    answer = trial.ipsys("replay", log.name, "--plot", "figures")
     number = len(list((trial.folder / "figures").glob("*")))
     lines = answer.strip().splitlines()
     return Outcome("Traceback" not in answer and number > 0, figure=f"{number} files; {lines[-1][:60]}")
@@ -118,6 +118,6 @@ FAULTS: Sequence[Fault] = (
     Fault("ODOMETRY for PX4 and ArduPilot", _odometry),
     Fault("VISION_POSITION_ESTIMATE for both autopilots", _vision),
     Fault("smooth without --model after a replay", _smooth),
-    Fault("replay --plots of a log with ground truth", _plots),
+    Fault("replay --plot of a log with ground truth", _plots),
     Fault("repaired log with a lost schema is read", _repaired),
 )

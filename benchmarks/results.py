@@ -39,6 +39,7 @@ BENCHMARKS = {
     "node_cost": "processor time of a node and of its centre, beside a plain recording",
     "checkouts": "speed of this checkout, compared with another one",
     "answers": "start of commands, evaluations, report and calibrate-lab",
+    "first_hour": "commands, waiting and errors of the first day in the simulated lab",
     "robot_run": "control error and true error of robots at waypoints, without and with faults",
     "joint": "error over the floor of calibrations, in simulated labs",
     "contradictions": "inputs that contradict the measurements: named, true error, coverage",

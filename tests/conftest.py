@@ -207,7 +207,7 @@ def replayed_log(detected_log: Path, tmp_path_factory: pytest.TempPathFactory) -
 
     def write(folder: Path) -> None:
         shutil.copy(detected_log, folder / "lab.mcap")
-        replay([folder / "lab.mcap"], Request())
+        replay([folder / "lab.mcap"], Request(models=("poly",)))
 
     return make_once(tmp_path_factory, "replayed", write) / "lab.mcap"
 
@@ -223,7 +223,7 @@ def calibration(lab_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
     """A log with a model that is fitted to the small simulated session."""
 
     def write(folder: Path) -> None:
-        replay([lab_log], Request(), output=folder / "calibration.mcap")
+        replay([lab_log], Request(models=("poly",)), output=folder / "calibration.mcap")
 
     return make_once(tmp_path_factory, "calibration", write) / "calibration.mcap"
 

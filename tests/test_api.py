@@ -20,7 +20,7 @@ from ipsys_log import IpsysError
 from ipsys_log.engine.output import write_log
 from ipsys_log.exchange.data_frames import TABLES
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import Message, Position, Positions, RigCamera, Track, Tracks
+from ipsys_log.messages import Message, Model, Position, Positions, RigCamera, Track, Tracks
 from ipsys_log.messages.channels import CAMERA_POINTS, MARKERS, POSITIONS, TRACKS, Channel
 from ipsys_log.messages.rig_file import rig_toml
 from tests.conftest import ROOT
@@ -47,6 +47,57 @@ def test_package_has_the_names_of_the_api() -> None:
     from ipsys_log.api import python_api as api
 
     assert set(ipsys.__all__) == {*api.__all__, "FittedCornerModel", "IpsysError"}
+
+
+@pytest.fixture(scope="module")
+def api_objects(replayed: Path) -> dict[str, Any]:
+    """Return an object of each public class, with as much content as a large lab gives it."""
+    result = ipsys.replay(replayed, models=["poly"])
+    log, player = ipsys.open(replayed), ipsys.play(replayed)
+    score = ipsys.Score(
+        model="poly", scheme="held_out", against="tape", dimensions="3d", points=150,
+        mean_mm=1.23456789, median_mm=1.23456789, p95_mm=1.23456789, rmse_mm=1.23456789,
+    )  # fmt: skip
+    compared, many = ipsys.ScoreComparison(score, score), np.zeros((9000, 2))
+    finding = ipsys.LogFinding("time", "remark", "the times decrease", "record again", "/runs/a/tracks", 5, 7)
+    track = Track("robot_0", 0, 1.0, 2.0, 0.2, 0.5, np.eye(3), ("red", "white"), True)
+    seen, lens = tuple((f"{n}.jpg", 0.2) for n in range(400)), replace(next(iter(lenses(replayed).values())))
+    calibration: Any = ipsys.CalibrationResult
+    objects = [
+        calibration("red", lens, ("fx",), many, many, True, many, many, 0.2, 0.1, 400, 400, *[seen] * 4, 0,
+                    many, ("move the board",), many, many),
+        ipsys.Comparison("/runs/poly/tracks", 5, 5, 5, 5),
+        ipsys.Export(replayed, 5, ("poly",)),
+        ipsys.Failure("red", "no image shows the board", True),
+        ipsys.FittedCornerModel(Model(0, "joint", ())),
+        ipsys.load_model(replayed, "poly"),
+        type(log.channels)(log.channels * 9),
+        ipsys.LiveTracks("poly", 5, (track,) * 100),
+        log,
+        ipsys.LogCheck(replayed, (finding,) * 500),
+        finding,
+        result.evaluations["poly"],
+        result.outcomes[0],
+        player,
+        result,
+        log.track_at("robot_0", log.table("tracks")["time"]),
+        score,
+        compared,
+        ipsys.ScoreResult("dataset", (score,) * 99, (compared,) * 99, (score,) * 9),
+        ipsys.Tracker(lambda _: []),
+        next(log.messages("images")),
+    ]  # fmt: skip
+    return {type(one).__name__: one for one in objects}
+
+
+@pytest.mark.parametrize(
+    "name", [name for name in ipsys.__all__ if isinstance(getattr(ipsys, name), type)] + ["Message"]
+)
+def test_object_prints_in_20_lines(api_objects: dict[str, Any], name: str) -> None:
+    if name == "IpsysError":
+        return
+    lines = repr(api_objects[name]).splitlines()
+    assert 0 < sum(1 + len(line) // 80 for line in lines) <= 20
 
 
 def test_tracker_keeps_few_tracks_of_a_loop_that_pauses() -> None:
@@ -162,6 +213,28 @@ def test_missing_values_are_nan_or_na(tmp_path: Path) -> None:
         assert positions_table["time_offset_ns"].isna().all()
 
 
+@pytest.mark.parametrize("name", ["tracks", "smoothed_tracks", "truth"])
+def test_segment_of_a_table_is_an_unbroken_track(
+    replayed: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ipsys_log.exchange.data_frames._BATCH", 7)  # a track goes on in the next part
+    with ipsys.open(replayed) as log:
+        rows: Any = log.table(name).itertuples()
+    last: dict[tuple[str, int], Any] = {}
+    begun = set()
+    for row in rows:
+        before = last.get(key := (row.robot, row.marker_id))
+        gap_ns = None if before is None else row.time.value - before.time.value
+        if gap_ns is None or gap_ns > getattr(row, "age_ns", 1_000_000_000):
+            assert row.segment not in begun
+            begun.add(row.segment)
+        else:
+            assert before is not None
+            assert row.segment == before.segment
+        last[key] = row
+    assert len(begun) > len(last) > 1
+
+
 def test_several_runs_add_a_column(replayed: Path) -> None:
     with ipsys.open(replayed) as log:
         both = log.table("tracks", run=RUNS)
@@ -240,12 +313,18 @@ def test_calibrate_without_images_is_one_line(tmp_path: Path) -> None:
         list(ipsys.calibrate(tmp_path / "nothing", board="6x4"))
 
 
-def test_live_tracks_and_records(lab_log: Path, replayed: Path, tmp_path: Path) -> None:
-    with Session([lab_log]) as session:
+def rig_of_log(log: Path, folder: Path) -> Path:
+    """Write a rig file whose cameras play the images of a log; return its path."""
+    with Session([log]) as session:
         (rig,) = session.payloads(["/rig"])
-    cameras = tuple(RigCamera(name, source=f"file:{lab_log}?{name}") for name in ("red", "white", "black"))
-    lab, target = tmp_path / "lab.toml", tmp_path / "live.mcap"
+    cameras = tuple(RigCamera(name, source=f"file:{log}?{name}") for name in ("red", "white", "black"))
+    lab = folder / "lab.toml"
     lab.write_text(rig_toml(replace(rig, cameras=cameras)))
+    return lab
+
+
+def test_live_tracks_and_records(lab_log: Path, replayed: Path, tmp_path: Path) -> None:
+    lab, target = rig_of_log(lab_log, tmp_path), tmp_path / "live.mcap"
     calibrations = lenses(lab_log)
     with ipsys.live(
         lab, record=target, model_from=replayed, models=RUNS, calibrations=calibrations
@@ -265,6 +344,14 @@ def test_live_tracks_and_records(lab_log: Path, replayed: Path, tmp_path: Path) 
         pass
 
 
+def test_live_without_record_tracks_and_writes_nothing(lab_log: Path, replayed: Path, tmp_path: Path) -> None:
+    lab = rig_of_log(lab_log, tmp_path)
+    with ipsys.live(lab, model_from=replayed, model="rigid", calibrations=lenses(lab_log)) as tracker:
+        assert next(tracks for tracks in tracker if tracks.tracks).run == "rigid"
+    assert ("fuse", "rigid") in {(outcome.stage, outcome.run) for outcome in tracker.outcomes}
+    assert [path.name for path in tmp_path.iterdir()] == ["lab.toml"]
+
+
 def test_live_says_what_is_wrong_on_entering(tmp_path: Path, replayed: Path) -> None:
     with (
         pytest.raises(IpsysError, match=r"lab\.toml"),
@@ -272,6 +359,16 @@ def test_live_says_what_is_wrong_on_entering(tmp_path: Path, replayed: Path) -> 
     ):
         pass
     assert not (tmp_path / "x.mcap").exists()
+    with pytest.raises(IpsysError, match="model_from"), ipsys.live(rig_of_log(replayed, tmp_path)):
+        pass
+
+
+def test_names_of_models_and_runs_select_the_same(replayed: Path) -> None:
+    with ipsys.open(replayed) as log, pytest.raises(IpsysError, match="run rigid_poly has no tracks"):
+        log.table("tracks", run="rigid+poly")
+    assert ipsys.replay(replayed, model="poly", until="fit").outcomes[-1].run == "poly"
+    with pytest.raises(IpsysError, match=r"has no fitted model bst \(it has: rigid, poly\)$"):
+        ipsys.load_model(replayed, "bst")
 
 
 def test_tables_without_pandas_are_one_line(replayed: Path, monkeypatch: pytest.MonkeyPatch) -> None:

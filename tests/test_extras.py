@@ -132,7 +132,7 @@ REFUSED = {
     "live --rerun --model-from model.mcap -o x.mcap": "--rerun needs Rerun: pip install 'ipsys_log[view]'",
     "report lab.mcap": "report needs Matplotlib and Jinja2: pip install 'ipsys_log[report]'",
     "markers --ids 0-3 --length 0.1": "markers needs Matplotlib: pip install 'ipsys_log[report]'",
-    "evaluate lab.mcap --plots x": "--plots needs Matplotlib: pip install 'ipsys_log[report]'",
+    "evaluate lab.mcap --plot x": "--plot needs Matplotlib: pip install 'ipsys_log[report]'",
     **{
         f"{command} --plot x.png": "--plot needs Matplotlib: pip install 'ipsys_log[report]'"
         for command in (

@@ -81,7 +81,7 @@ evaluate lab.mcap --model rigid
 locate lab.mcap
 fuse lab.mcap
 smooth lab.mcap
-replay lab.mcap --model rigid --plots figures
+replay lab.mcap --model rigid --plot figures
 report lab.mcap --model rigid
 info lab.mcap
 runs lab.mcap

@@ -41,7 +41,7 @@ def test_all_models_are_studied_by_one_command(ipsys: Ipsys, data: Path, tmp_pat
     """Return the tables, the figures and the page; Tables I and II have the paper's rows."""
     log, folder = tmp_path / "imsel.mcap", tmp_path / "figures"
     ipsys("import", "imsel", data / "imsel", "-o", log)
-    done = ipsys("evaluate", log, "--plots", folder, "--json")
+    done = ipsys("evaluate", log, "--plot", folder, "--json")
     answer = json.loads(done.out)
     models, advice = answer["models"], answer["recommendation"]["sentences"]
     assert len(models) == 11

@@ -74,7 +74,7 @@ def found_markers(log: Path) -> dict[tuple[str, int], list[int]]:
 def test_positions_are_those_of_the_pictures(video: Path, lab: Path) -> None:
     tracks = []
     for log in (video, lab):
-        pipeline.replay([log], Request())
+        pipeline.replay([log], Request(models=("poly",)))
         with Session([log]) as session:
             tracks.append(
                 {

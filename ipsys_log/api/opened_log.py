@@ -22,7 +22,8 @@ from ipsys_log.log.location import LogLocation, LogUrl, is_one_of
 from ipsys_log.log.log_files import find_logs
 from ipsys_log.messages import Message
 from ipsys_log.messages.channels import CHANNELS, TRACKS, TRUTH, Channel
-from ipsys_log.plain_text import shell_words
+from ipsys_log.models.table import model_run
+from ipsys_log.plain_text import join_names, shell_words
 from ipsys_log.statistics.accuracy import root_mean_square_m
 from ipsys_log.statistics.ground_truth import gather_paths, trajectory_errors
 
@@ -39,6 +40,8 @@ Time = int | datetime
 
 
 _Row = TypeVar("_Row", bound=NamedTuple)
+# A longer listing prints its first and last rows: a log with all models has a hundred channels.
+_MOST_LINES = 20
 
 
 class Listing(tuple[_Row, ...]):
@@ -51,10 +54,14 @@ class Listing(tuple[_Row, ...]):
             return "(none)"
         rows = [self[0]._fields, *(tuple(map(_cell, row)) for row in self)]
         widths = [max(len(row[n]) for row in rows) for n in range(len(rows[0]))]
-        return "\n".join(
+        lines = [
             "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
             for row in rows
-        )
+        ]
+        if len(lines) > _MOST_LINES:
+            half = _MOST_LINES // 2
+            lines[half : 1 - half] = [f"... {len(lines) - 2 * half + 1} more rows; iterate to read all"]
+        return "\n".join(lines)
 
     def _repr_html_(self) -> str:
         if not self:
@@ -115,7 +122,8 @@ class Log:
 
     def __repr__(self) -> str:
         runs = len(self._session.run_names())
-        return f"<Log {self._session}: {len(self._session.images)} cameras, {runs} runs>"
+        names = join_names([str(path) for path in self.paths])
+        return f"<Log {names}: {len(self._session.images)} cameras, {runs} runs>"
 
     @property
     def paths(self) -> tuple[LogLocation, ...]:
@@ -160,7 +168,7 @@ class Log:
         Parameters
         ----------
         channel : its name, such as ``images``, ``markers`` or ``tracks``.
-        run : the run of a derived channel; None: the newest complete one.
+        run : the run of a derived channel, or its model; None: the newest complete one.
         start, end : log times, as an integer in ns or a datetime with a time zone; the end is not included.
 
         Raises
@@ -187,7 +195,8 @@ class Log:
         ----------
         name : ``markers``, ``camera_points``, ``pairs``, ``positions``, ``tracks``, ``truth``,
             ``measurements``, ``events`` or ``latency``.
-        run : the run of a derived channel; None: the newest complete one; several: a column ``run`` names it.
+        run : the run of a derived channel, or its model; None: the newest complete one; several: a column
+            ``run`` names it.
         start, end : as for :meth:`messages`.
 
         Raises
@@ -310,7 +319,7 @@ class Log:
         IpsysError
             There is no such robot or run, or a time has no time zone.
         """
-        return sample_track(self._session, robot, times, run)
+        return sample_track(self._session, robot, times, run and model_run(run))
 
     def check(self) -> tuple[LogCheck, ...]:
         """Read the logs completely and check them, as ``ipsys.check()`` does; a result for each log."""
@@ -323,6 +332,7 @@ class Log:
             if run is not None:
                 raise IpsysError(f"channel {channel.name} is recorded and belongs to no run; leave run out")
             return None
+        run = run and model_run(run)
         name = run or newest_run(self._session, channel)
         if name is None or not self._session.topics(channel, name):
             known = [

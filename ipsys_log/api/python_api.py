@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,12 +27,15 @@ from ipsys_log.log.location import LogUrl, parse_location
 from ipsys_log.log.log_files import find_logs
 from ipsys_log.messages import Array, CameraCalibration, ErrorStatistics, Evaluation, Model, Rig
 from ipsys_log.messages.channels import EVALUATION
-from ipsys_log.models.table import AppliedModel, reads_corners
+from ipsys_log.models.table import AppliedModel, model_run, reads_corners
+from ipsys_log.plain_text import join_names
+from ipsys_log.statistics.accuracy import POOLED
 from ipsys_log.tools.differences import Comparison
 from ipsys_log.tools.publish.scores import Score
 from ipsys_log.tools.publish.scoring import ScoreComparison, ScoreResult
 from ipsys_log.tools.soundness.check import check_logs
 from ipsys_log.tools.soundness.finding import LogCheck, LogFinding
+from ipsys_log.units import CM_PER_M
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -97,6 +101,14 @@ class ModelEvaluation:
     run: str
     evaluation: Evaluation
 
+    def __repr__(self) -> str:
+        means = [
+            f"{row['scheme']} {row['dimensions']} against {row['against']}: {row['mean_m'] * CM_PER_M:.2f} cm"
+            for row in self.rows()
+            if row["camera"] == POOLED
+        ]
+        return "\n  ".join([f"<ModelEvaluation of {self.model}, run {self.run}; mean errors:", *means]) + ">"
+
     def to_frame(self) -> pd.DataFrame:
         """Return the errors as a table: a row for each camera ("" for all), scheme and dimension."""
         from ipsys_log.exchange.data_frames import import_pandas
@@ -127,11 +139,20 @@ class ReplayResult:
     outcomes: tuple[Outcome, ...]
     evaluations: Mapping[str, ModelEvaluation]
 
+    def __repr__(self) -> str:
+        new = sum(outcome.fresh for outcome in self.outcomes)
+        runs = join_names(list(dict.fromkeys(outcome.run for outcome in self.outcomes)))
+        evaluated = join_names(list(self.evaluations)) or "none"
+        return (
+            f"<ReplayResult: {len(self.outcomes)} stages, {new} new; runs {runs}; evaluations: {evaluated}>"
+        )
+
 
 @one_reading()
 def replay(
     *paths: StrPath | LogUrl,
-    models: Iterable[str] = (),
+    model: str | Iterable[str] = (),
+    models: str | Iterable[str] = (),
     until: str | None = None,
     rig: Rig | StrPath | None = None,
     calibrations: Mapping[str, CameraCalibration] | None = None,
@@ -157,7 +178,8 @@ def replay(
 
     Parameters
     ----------
-    models : names of models, such as ``best``; none: ``poly``, or all models for an evaluation.
+    model : a name of a model, such as ``best``, or several; none: as ``ipsys replay`` chooses.
+    models : the old name of ``model``.
     until : the last stage, such as ``detect`` or ``evaluate``; None: all stages.
     rig, calibrations : they replace those of the log, as a new run; calibrations by camera.
     model_from : another log; its fitted model is applied and copied into the log.
@@ -179,7 +201,7 @@ def replay(
     from ipsys_log.messages.rig_file import load_rig
 
     request = Request(
-        models=tuple(models),
+        models=_names(model, models),
         rig=rig if rig is None or isinstance(rig, Rig) else load_rig(Path(rig)),
         lenses=dict(calibrations or {}),
         model_from=None if model_from is None else parse_location(model_from),
@@ -198,6 +220,12 @@ def replay(
     written = [target] if target is not None and target.exists() else []
     with Session([*logs, *written]) as session:
         return ReplayResult(tuple(outcomes), _evaluations(session, outcomes))
+
+
+def _names(*given: str | Iterable[str]) -> tuple[str, ...]:
+    """Return the names of models, each once; a text is one name."""
+    names = [[one] if isinstance(one, str) else one for one in given]
+    return tuple(dict.fromkeys(chain.from_iterable(names)))
 
 
 def _evaluations(session: Session, outcomes: Sequence[Outcome]) -> dict[str, ModelEvaluation]:
@@ -254,7 +282,8 @@ def verify(
 def score(
     dataset: StrPath,
     *,
-    models: Sequence[str] = (),
+    model: str | Iterable[str] = (),
+    models: str | Iterable[str] = (),
     own: Mapping[str, Callable[[], object]] | None = None,
     progress: Progress = lambda stage, done, total: None,
     say: Callable[[str], None] = lambda text: None,
@@ -266,7 +295,8 @@ def score(
     Parameters
     ----------
     dataset : a folder, a zip archive, or the address of a zip archive.
-    models : names of models to repeat; ``FILE.py:CLASS`` is a model of your own. None: all models.
+    model : a name of a model to repeat, or several; ``FILE.py:CLASS`` is a model of your own. None: all.
+    models : the old name of ``model``.
     own : classes of your own models by name. Each has ``fit(points_m, world_m)`` and ``predict(points_m)``:
         camera points (n, 3) to world points (n, 3), in m. They are scored in the same folds.
 
@@ -288,7 +318,7 @@ def score(
     from ipsys_log.tools.publish.scoring import score as score_pack
 
     of_user = [OwnModel(name, create) for name, create in (own or {}).items()]
-    return score_pack(os.fspath(dataset), [*models, *of_user], progress, say)
+    return score_pack(os.fspath(dataset), [*_names(model, models), *of_user], progress, say)
 
 
 class FittedModel:
@@ -338,7 +368,7 @@ def load_model(path: StrPath | LogUrl, name: str | None = None) -> FittedModel |
 
     Parameters
     ----------
-    name : the name in the table of models, such as ``best``; None: the newest of all.
+    name : a model, such as ``best``, or a run with a model, such as ``best_2``; None: the newest of all.
 
     Returns
     -------
@@ -406,9 +436,10 @@ def calibrate(
 def live(
     rig: StrPath,
     *,
-    record: StrPath,
-    model_from: StrPath | LogUrl,
-    models: Iterable[str] = (),
+    record: StrPath | None = None,
+    model_from: StrPath | LogUrl | None = None,
+    model: str | Iterable[str] = (),
+    models: str | Iterable[str] = (),
     cameras: Sequence[str] = (),
     calibrations: Mapping[str, CameraCalibration] | None = None,
     corners: str | None = None,
@@ -416,14 +447,15 @@ def live(
     force: bool = False,
     say: Callable[[str], None] = lambda text: None,
 ) -> Tracker:
-    """Track robots with the cameras of a rig file, and record everything.
+    """Track robots with the cameras of a rig file; with ``record``, write everything into a log.
 
     Parameters
     ----------
     rig : the rig file, ``lab.toml``; the streams of its ``[stream]`` are opened.
-    record : the new log.
+    record : the new log; None: nothing is recorded.
     model_from : the log with the fitted models, a file or a URL.
-    models : names of models; none: ``poly`` if there is one, else the newest.
+    model : a name of a model, or several; none: that of the newest run of the log.
+    models : the old name of ``model``.
     cameras : only these cameras of the rig.
     calibrations : they replace the intrinsics that the rig names, by camera.
     corners, method : as the options of ``ipsys live``.
@@ -441,16 +473,18 @@ def live(
 
     Examples
     --------
-    >>> with live("lab.toml", record="mon.mcap", model_from="cal.mcap") as tracker:  # doctest: +SKIP
+    >>> with live("lab.toml", model_from="cal.mcap") as tracker:  # doctest: +SKIP
     ...     for tracks in tracker:
     ...         print(tracks.time_ns, tracks.tracks)
     """
     request = Request(
-        models=tuple(dict.fromkeys(models)),
-        model_from=parse_location(model_from),
+        models=_names(model, models),
+        model_from=None if model_from is None else parse_location(model_from),
         corners=corners,
         method=method,
     )
+
+    target = None if record is None else Path(record)
 
     def track(tracker: Tracker) -> list[Outcome]:
         from ipsys_log.capture.lab import open_lab
@@ -464,7 +498,7 @@ def live(
             say(f"camera {camera}: {text}")
         for line in check_start(lab.rig, lab.names, lab.lenses, request, None):
             say(line)
-        if Path(record).exists() and not force:
+        if target is not None and target.exists() and not force:
             raise IpsysError(f"{record}: exists already; give another name, or force=True to overwrite it")
         streamed = settings_of_rig(lab.rig.stream, lab.folder)
         for line in check_streams(streamed):
@@ -473,7 +507,7 @@ def live(
             tracker.begin(opened.cameras.stop)
             sinks: list[Sink] = [tracker, *streams]
             return pipeline.live(
-                opened.cameras, opened.settings, Path(record), request, sinks=sinks, overwrite=force
+                opened.cameras, opened.settings, target, request, sinks=sinks, overwrite=force
             )
 
     return Tracker(track)
@@ -557,4 +591,4 @@ def play(
         foxglove=foxglove,
         images=images,
     )
-    return Player(find_logs(paths), run, topics, options, settings, clock, say)
+    return Player(find_logs(paths), run and model_run(run), topics, options, settings, clock, say)

@@ -97,6 +97,10 @@ class CalibrationResult:
     pixels: Array
     residuals_px: Array
 
+    def __repr__(self) -> str:
+        used = f"{len(self.used)} of {self.examined_count} images"
+        return f"<CalibrationResult of {self.camera}: {used}, reprojection RMS {self.rms_px:.3f} px>"
+
 
 def calibrate(
     camera: str, search: SearchResult, board: Board, model: LensModel, force: bool = False

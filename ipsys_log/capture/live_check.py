@@ -20,10 +20,11 @@ import numpy as np
 
 from ipsys_log.errors import FrameError
 from ipsys_log.messages import CAMERA_MOVED, Array, CompressedImage, CompressedVideo, Markers, Message, Rig
+from ipsys_log.messages.events import MODEL_CONTRADICTED
 from ipsys_log.stages.detect.misprints import find_misprints
 from ipsys_log.stages.detect.search import count_wrong_cells, search_squares
-from ipsys_log.statistics.disagreement import OverlapStream
-from ipsys_log.units import MM_PER_M, NS_PER_S
+from ipsys_log.statistics.disagreement import Difference, OverlapStream
+from ipsys_log.units import CM_PER_M, MM_PER_M, NS_PER_S
 from ipsys_log.vision.decode import decode_grey
 from ipsys_log.vision.video import decode_keyframe, is_keyframe
 
@@ -54,12 +55,20 @@ _OVERLAP_BEFORE_NS = 3 * NS_PER_S // 2
 _FEWEST_OVERLAP = 4
 
 
+# Two cameras differ by less, unless the model is of another lab. The first so many differences show it.
+_MOST_OVERLAP_M, _FIRST_OVERLAP = 0.1, 10
+
+
 class Knock(NamedTuple):
-    """A warning that a camera has moved, as a text for the user; ``camera`` is None if two are possible."""
+    """A warning that a camera has moved, as a text for the user; ``camera`` is None if two are possible.
+
+    The ``kind`` is that of its event: the model can contradict the cameras from the start, too.
+    """
 
     time_ns: int
     camera: str | None
     text: str
+    kind: str = CAMERA_MOVED
 
 
 @dataclass(slots=True, eq=False)
@@ -138,6 +147,7 @@ class KnockMonitor:
         self._shifts_m: dict[tuple[str, int], float] = {}
         self._watched_ns: dict[str, int] = {}
         self._pairs: dict[tuple[tuple[str, str], int], _History] = {}
+        self._first_m: dict[tuple[str, str], list[float]] = {}
 
     def __call__(self, message: Message) -> Iterator[Knock]:
         """Yield the warnings that a message causes."""
@@ -147,6 +157,7 @@ class KnockMonitor:
             key = difference.cameras, difference.marker_id
             history = self._pairs.setdefault(key, _History(_OVERLAP_BEFORE_NS, _FEWEST_OVERLAP))
             history.add(difference.time_ns, np.array(difference[3:]))
+            yield from self._compare_first(difference)
             yield from self._see_difference(difference.cameras, history)
 
     def _see_markers(self, camera: str, frame: Markers) -> Iterator[Knock]:
@@ -203,6 +214,23 @@ class KnockMonitor:
             f"camera {camera} has moved{doubt}: {len(markers)} of {present} reference markers in its image "
             f"shifted by {shift_mm:.1f} mm; to measure it: ipsys drift",
         )
+
+    def _compare_first(self, difference: Difference) -> Iterator[Knock]:
+        """Warn if the first differences of two cameras contradict the model."""
+        first_m = self._first_m.setdefault(difference.cameras, [])
+        if len(first_m) == _FIRST_OVERLAP:
+            return
+        first_m.append(hypot(difference.x_m, difference.y_m))
+        middle_m = float(np.median(first_m))
+        if len(first_m) == _FIRST_OVERLAP and middle_m > _MOST_OVERLAP_M:
+            yield Knock(
+                difference.time_ns,
+                None,
+                f"cameras {' and '.join(difference.cameras)} place marker {difference.marker_id} "
+                f"{middle_m * CM_PER_M:.0f} cm apart: the model is of another lab, a camera has moved, or "
+                "marker_height_m is wrong; calibrate again",
+                MODEL_CONTRADICTED,
+            )
 
     def _see_difference(self, pair: tuple[str, str], history: _History) -> Iterator[Knock]:
         now_ns = history.rows[-1][0]
@@ -339,7 +367,7 @@ def knock_events(rig: Rig, add_event: Callable[[str, str, str | None], object]) 
 
     def watch(message: Message) -> None:
         for knock in monitor(message):
-            add_event(CAMERA_MOVED, knock.text, knock.camera)
+            add_event(knock.kind, knock.text, knock.camera)
 
     return watch
 

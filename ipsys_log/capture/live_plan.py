@@ -9,7 +9,9 @@ from ipsys_log.capture.frames import CameraState
 from ipsys_log.capture.nodes.wire import MARKERS_FORMAT
 from ipsys_log.engine.execute import LiveRun, copy_messages
 from ipsys_log.engine.graph import Task, copy_model, is_of_model, stages_until
-from ipsys_log.engine.request import Request, wanted_models
+from ipsys_log.engine.model_checks import compare_labs
+from ipsys_log.engine.model_choice import applied_models
+from ipsys_log.engine.request import Request
 from ipsys_log.engine.stream import WiredStage, wire
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import CameraCalibration, Message, Model, Rig
@@ -30,12 +32,13 @@ from ipsys_log.stages.detect import usual_corners
 class LivePlan(NamedTuple):
     """The plan of a live run.
 
-    It has the rig, the completed request, and the models of another log with the tasks that copy them. It
-    also has the runs in the order of their records, and the causal stages.
+    It has the rig, the completed request, the reason for its models, and the models of another log with the
+    tasks that copy them. It also has the runs in the order of their records, and the causal stages.
     """
 
     rig: Rig
     request: Request
+    reason: str
     copied: list[tuple[Task, Model]]
     runs: list[LiveRun]
     stages: list[WiredStage]
@@ -115,17 +118,22 @@ def plan_live(
     models = [model for _, model in copied]
     _check(rig, cameras, lenses, models, until)
     wired = _wire(pictured, settings, lenses, request, copied, until, imported_run(cameras))
-    return LivePlan(rig, request, copied, *wired)
+    reason = applied_models(request)[1] if copied else ""
+    return LivePlan(rig, request, reason, copied, *wired)
 
 
 def check_start(
-    rig: Rig, cameras: Collection[str], lenses: Collection[str], request: Request, until: str | None
+    rig: Rig,
+    cameras: Collection[str],
+    lenses: Mapping[str, CameraCalibration],
+    request: Request,
+    until: str | None,
 ) -> list[str]:
     """Check, before a camera is opened, that a live run can be planned.
 
     Parameters
     ----------
-    cameras, lenses : the names of the cameras, and of the cameras with intrinsics.
+    cameras, lenses : the names of the cameras, and the intrinsics by camera.
     request, until : as for :func:`plan_live`.
 
     Returns
@@ -135,11 +143,14 @@ def check_start(
     Raises
     ------
     IpsysError
-        As for :func:`plan_live`.
+        As for :func:`plan_live`; or the model is for other cameras.
     """
     models = [model for _, model in _copied(request, until)]
     _check(rig, cameras, lenses, models, until)
-    return [
+    if not models:
+        return []
+    assert request.model_from is not None
+    return compare_labs(request.model_from, rig, lenses) + [
         f"camera {name}: {request.model_from} has no model of this camera; it is recorded, but not used "
         "for tracking"
         for model in models
@@ -149,7 +160,7 @@ def check_start(
 
 def shown_run(request: Request) -> str:
     """Return the run of the first model: streams, viewers and the dashboard show one run."""
-    return model_run(wanted_models(request)[0])
+    return model_run(applied_models(request)[0][0])
 
 
 def check_model(model: Model, cameras: Collection[str]) -> None:
@@ -171,7 +182,12 @@ def check_model(model: Model, cameras: Collection[str]) -> None:
 def _copied(request: Request, until: str | None) -> list[tuple[Task, Model]]:
     """Return the models of another log to apply, with the tasks that copy them in; none before locate."""
     reads_model = any(MODEL in stage.reads for stage in _causal(until))
-    return [copy_model(request, name) for name in wanted_models(request)] if reads_model else []
+    if reads_model and request.model_from is None:
+        raise IpsysError(
+            "no fitted model is given; give the log of a calibration: --model-from LOG (in Python: "
+            "model_from). To fit one: ipsys calibrate-lab LOG"
+        )
+    return [copy_model(request, name) for name in applied_models(request)[0]] if reads_model else []
 
 
 def _causal(until: str | None) -> list[Stage]:

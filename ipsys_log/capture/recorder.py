@@ -70,6 +70,7 @@ class Recording:
 
     Parameters
     ----------
+    writer : of the log; None: nothing is written.
     free : releases the reserved disk space.
 
     Attributes
@@ -81,11 +82,11 @@ class Recording:
     syncer : syncs the log to the disk.
     """
 
-    def __init__(self, writer: LogWriter, free: Callable[[], None]) -> None:
+    def __init__(self, writer: LogWriter | None, free: Callable[[], None] = lambda: None) -> None:
         self.counts: dict[str, int] = {}
         self.full: WriteError | None = None
         self.is_deleted = self.is_renamed = False
-        self.path = writer.path
+        self.path = Path(os.devnull) if writer is None else writer.path
         self.syncer = Syncer(self._sync)
         self._writer, self._free = writer, free
         self._lock = threading.Lock()
@@ -99,15 +100,19 @@ class Recording:
         WriteError
             The disk is full, and the reserved space is used up too.
         """
-        data = serialize(message)  # another thread may write meanwhile
-        self._write(lambda: write_message(self._writer, message, self.counts, data))
+        if (writer := self._writer) is not None:
+            data = serialize(message)  # another thread may write meanwhile
+            self._write(lambda: write_message(writer, message, self.counts, data))
 
     def flush(self) -> None:
         """Pass all messages to the disk."""
-        self._write(self._writer.flush)
+        if self._writer is not None:
+            self._write(self._writer.flush)
 
     def look(self) -> None:
         """Note whether another program has deleted or renamed the log."""
+        if self._writer is None:
+            return
         try:
             own = os.fstat(self._writer.fd)
         except OSError:  # a fault of the disk is no proof
@@ -157,7 +162,8 @@ class Recording:
 
     def _sync(self) -> None:
         self.look()
-        self._writer.sync()
+        if self._writer is not None:
+            self._writer.sync()
 
     def _write(self, write: Callable[[], None]) -> None:
         with self._lock:
@@ -215,12 +221,13 @@ def write_each(
 
 @contextmanager
 def open_recording(
-    path: Path, settings: Iterable[Message] = (), overwrite: bool = False
+    path: Path | None, settings: Iterable[Message] = (), overwrite: bool = False
 ) -> Iterator[Recording]:
     """Write a new log that keeps its messages even if an exception ends the block.
 
     Parameters
     ----------
+    path : None: nothing is written.
     settings : rig, intrinsics and models of the recording. They are in the file before the block begins, even
         if the recorder is killed soon.
     overwrite : replace an existing log, unless another process is writing it. The old log is deleted only
@@ -233,6 +240,9 @@ def open_recording(
     IpsysError
         The disk has too little space to finish the log properly.
     """
+    if path is None:
+        yield Recording(None)
+        return
     created = _create(path, overwrite)
     try:
         with ExitStack() as resources:

@@ -49,8 +49,12 @@ _CHECKED_MESSAGES = 100
 
 def check_inputs(
     paths: Sequence[LogLocation], request: Request, models: Sequence[str], stages: Sequence[Stage]
-) -> None:
+) -> list[str]:
     """Check the inputs of some stages; the last one is the purpose of the command.
+
+    Returns
+    -------
+    One line for each remark.
 
     Raises
     ------
@@ -59,6 +63,7 @@ def check_inputs(
     """
     written = {channel for stage in stages for channel in stage.writes}
     _check_request(paths, request, models)
+    remarks: list[str] = []
     with Session(paths) as session:
         _check_rigs(session, request)
         cameras = _cameras(session, written)
@@ -74,7 +79,7 @@ def check_inputs(
         if POSITIONS in written:
             check_heights(session, request, models)
         if MODEL in written and request.model_from is not None:
-            check_models(session, request, models, written, cameras)
+            remarks = check_models(session, request, models, written, cameras)
         if EVALUATION in written and request.model_from is not None:
             check_evaluated(session, request, models)
         if EVALUATION in stages[-1].writes:
@@ -82,6 +87,7 @@ def check_inputs(
         _check_versions(session, request, models, stages)
         _check_run_name(session, request, stages[-1])
         _check_new_stages(session, request, models, stages)
+    return remarks
 
 
 def _check_versions(
@@ -117,7 +123,7 @@ def _check_new_stages(
     for stage in sorted(stages, key=is_of_model) if request.run is not None else ():
         name = request.run if has_given_name(stage, stages[-1]) else None
         if not new.intersection(stage.reads):
-            run = _current_run(session, request, models[0], stage, inputs, name)
+            run = _current_run(session, request, next(iter(models), ""), stage, inputs, name)
             if run is not None:
                 inputs.update({channel: run for channel in stage.writes if channel is not RUN_EVENTS})
                 continue

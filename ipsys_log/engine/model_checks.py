@@ -3,6 +3,7 @@
 from array import array
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from math import hypot
 from statistics import median
 
 import numpy as np
@@ -15,7 +16,8 @@ from ipsys_log.engine.view import LogView
 from ipsys_log.errors import FitError, IpsysError
 from ipsys_log.log.contents import camera_of_topic
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import Event, Markers, Message, Positions, kind_of
+from ipsys_log.log.location import LogLocation
+from ipsys_log.messages import CameraCalibration, Event, Markers, Message, Positions, Rig, kind_of
 from ipsys_log.messages.channels import CAMERA_POINTS, EVALUATION, MARKERS, POSITIONS, RIG, Channel
 from ipsys_log.messages.events import CONTRADICTIONS
 from ipsys_log.models.table import needs_height
@@ -23,7 +25,7 @@ from ipsys_log.plain_text import shell_words
 from ipsys_log.statistics.calibration_points import measured, split_ids, training_pairs
 from ipsys_log.statistics.model_kinds import can_evaluate, model_kind
 from ipsys_log.statistics.tape import RiggedMeasurement, world_point
-from ipsys_log.units import format_time
+from ipsys_log.units import CM_PER_M, format_time
 
 
 def check_measurements(session: Session, request: Request, models: Sequence[str]) -> None:
@@ -97,8 +99,12 @@ def check_evaluated(session: Session, request: Request, models: Sequence[str]) -
 
 def check_models(
     session: Session, request: Request, models: Sequence[str], written: Collection[Channel], cameras: set[str]
-) -> None:
+) -> list[str]:
     """Check that the other log has the models, and that they can be applied if a stage applies them.
+
+    Returns
+    -------
+    One line for each difference of the rigs.
 
     Raises
     ------
@@ -121,6 +127,62 @@ def check_models(
                     f"{', '.join(sorted(fitted))}, but the log has {', '.join(sorted(cameras))}; give a "
                     "model of these cameras"
                 )
+    lenses = {name: session.payloads([topic])[-1] for name, topic in session.calibrations.items()}
+    rig = request.rig or next(iter(session.payloads(session.topics(RIG))[-1:]), None)
+    return compare_labs(request.model_from, rig, {**lenses, **request.lenses})
+
+
+# Two cameras of one type differ by about 1 % in focal length; another lens or another crop by more.
+_MOST_FOCAL_CHANGE = 0.03
+# Smaller differences are corrections of the same lab.
+_MOST_POINT_CHANGE_M, _MOST_SIDE_CHANGE = 0.02, 0.01
+
+
+def compare_labs(
+    model_from: LogLocation, rig: Rig | None, lenses: Mapping[str, CameraCalibration]
+) -> list[str]:
+    """Compare a lab with that of a model; return one line for each difference of the rigs.
+
+    Parameters
+    ----------
+    model_from : the log with the model.
+    rig, lenses : those of the present lab; its intrinsics by camera.
+
+    Raises
+    ------
+    IpsysError
+        A camera has another lens, or other images: the model gives wrong positions.
+    """
+    with Session([model_from]) as other:
+        fitted = {camera: other.payloads([topic])[-1] for camera, topic in other.calibrations.items()}
+        rigs = other.payloads(other.topics(RIG))[-1:]
+    for camera in sorted(fitted.keys() & lenses.keys()):
+        own, recorded = (float(lens.K[0, 0] / lens.width) for lens in (lenses[camera], fitted[camera]))
+        if abs(own / recorded - 1) > _MOST_FOCAL_CHANGE:
+            raise IpsysError(
+                f"camera {camera}: its focal length is {own:.3f} image widths, but {recorded:.3f} in "
+                f"{model_from}: this is a model of other cameras; calibrate this lab, and give its log to "
+                "--model-from"
+            )
+    if rig is None or not rigs:
+        return []
+    lines = []
+    places_m = {point.name: point for point in rigs[0].reference_points}
+    for point in rig.reference_points:
+        twin = places_m.get(point.name)
+        shift_m = 0.0 if twin is None else hypot(point.x_m - twin.x_m, point.y_m - twin.y_m)
+        if shift_m > _MOST_POINT_CHANGE_M:
+            lines.append(
+                f"reference point {point.name} is {shift_m * CM_PER_M:.1f} cm from its place in "
+                f"{model_from}: positions are in the coordinates of that log"
+            )
+    own_m, recorded_m = rig.marker_length_m, rigs[0].marker_length_m
+    if abs(own_m / recorded_m - 1) > _MOST_SIDE_CHANGE:
+        lines.append(
+            f"marker_length_m is {own_m:g}, but {recorded_m:g} in {model_from}: check it with a ruler, or "
+            "give a model of this lab"
+        )
+    return lines
 
 
 def check_heights(session: Session, request: Request, models: Sequence[str]) -> None:

@@ -18,6 +18,7 @@ from ipsys_log.engine.checks import check_earlier_runs, describe_changed_images
 from ipsys_log.engine.execute import compute_messages, one_blas_thread, record_of, run_stage
 from ipsys_log.engine.graph import Task, copy_model, is_of_model, plan_stage
 from ipsys_log.engine.model_checks import check_fits
+from ipsys_log.engine.model_choice import Choice
 from ipsys_log.engine.pieces import DividedRun, PieceWorkers, divide_run
 from ipsys_log.engine.provenance import Outcome, find_run, imported_inputs
 from ipsys_log.engine.request import Progress, Request
@@ -39,8 +40,8 @@ class Replay:
 
     Attributes
     ----------
-    request : the options of the stages.
-    stages, models : those to compute, in order.
+    choice : the models, and the options of the stages.
+    stages : those to compute, in order.
     logs, target : the logs to read as one, and the log that gets the results.
     workers, local : they compute the pieces of a long log, and the evaluations of several models.
     progress, say : called with the state of the work, and with remarks.
@@ -49,9 +50,8 @@ class Replay:
     divided : the run in work, if the workers compute it.
     """
 
-    request: Request
+    choice: Choice
     stages: Sequence[Stage]
-    models: Sequence[str]
     logs: Sequence[LogLocation]
     target: Path
     workers: PieceWorkers
@@ -63,7 +63,17 @@ class Replay:
     divided: DividedRun | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
-        self.unchecked = list(self.models) if len(self.models) > 1 else []
+        self.unchecked = [*self.models] if len(self.models) > 1 else []
+
+    @property
+    def request(self) -> Request:
+        """The options of the stages."""
+        return self.choice.request
+
+    @property
+    def models(self) -> tuple[str, ...]:
+        """The models to fit or apply, in order."""
+        return self.choice.models
 
     def compute(self) -> None:
         """Run the stages that all models share, and then those of each model.
@@ -78,9 +88,14 @@ class Replay:
         of_model = [stage for stage in self.stages if is_of_model(stage)]
         self._run_stages([stage for stage in self.stages if stage not in of_model], shared)
         inputs = {model: dict(shared) for model in self.models}
+        if of_model and self.choice.reason:
+            self.say(self.choice.reason)
         # All fits come first: the evaluations then need nothing from one another.
         fits = [stage for stage in of_model if stage.of_model]
         self._run_models(fits, inputs)
+        if not inputs and self.choice.second is not None:
+            inputs[self.choice.second] = dict(shared)
+            self._run_models(fits, inputs)
         self._run_models([stage for stage in of_model if stage not in fits], inputs)
 
     def _run_models(self, stages: Sequence[Stage], inputs: dict[str, dict[Channel, str]]) -> None:

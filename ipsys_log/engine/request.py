@@ -1,6 +1,6 @@
 """The requests of the user, and the models, the rig and the settings of a log that they select."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -13,7 +13,7 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.log.location import LogLocation
 from ipsys_log.messages import CameraCalibration, Model, Rig
 from ipsys_log.messages.channels import MARKERS, MODEL, RIG
-from ipsys_log.models.table import CORNER_MODELS, MODELS, check_name
+from ipsys_log.models.table import is_known
 from ipsys_log.plain_text import shell_words
 from ipsys_log.stages import CORNERS, METHOD
 from ipsys_log.statistics.calibration_points import has_measurements
@@ -28,8 +28,7 @@ class Request:
 
     Attributes
     ----------
-    models : names in the table of models; empty: ``poly``, or the model of ``model_from``; for an evaluation,
-        all models.
+    models : names in the table of models; empty: see :func:`ipsys_log.engine.model_choice.choose_models`.
     rig, lenses : used instead of those of the log, as a new run. Camera intrinsics by camera.
     model_from : another log; its newest fitted model is applied and copied into the log.
     model_run : a run of the log whose model was copied from another log; it is applied again.
@@ -86,68 +85,32 @@ class Request:
 MIN_OFFSETS, LEAST_OFFSET_PX = 10, 0.05
 
 
-def wanted_models(
-    request: Request, paths: Sequence[LogLocation] = (), usual: Sequence[str] = ("poly",)
-) -> tuple[str, ...]:
-    """Return the names of the models to fit or apply.
-
-    The first of these cases applies:
-
-    - the models of the request;
-    - ``poly``, or another model of ``model_from``;
-    - the models that were copied into the logs of ``paths``, if these have no measurements to fit to;
-    - the ``usual`` models.
-
-    Raises
-    ------
-    IpsysError
-        A name is not in the table, or a log has no fitted model to apply.
-    """
-    for name in request.models:
-        check_name(name)
-    if request.models:
-        return request.models
-    if request.model_from is not None:
-        with Session([request.model_from]) as other:
-            names = {other.payloads([topic])[-1].name for topic in _model_topics(other)}
-            return ("poly" if "poly" in names else fitted_in(other, None)[0].name,)
-    if paths:
-        with Session(paths) as session:
-            copied = _copied_models(session)
-        if copied:
-            return copied
-    return tuple(usual)
-
-
 def has_corners(session: Session) -> bool:
     """Return whether a log has the corners of markers, or images to detect them in."""
     return bool(session.images) or newest_run(session, MARKERS) is not None
 
 
-def evaluated_models(paths: Sequence[LogLocation]) -> tuple[str, ...]:
-    """Return all models that the logs of ``paths`` can have: those of corners only if they have corners."""
-    with Session(paths) as session:
-        return (*MODELS, *(CORNER_MODELS if has_corners(session) else ()))
-
-
 def fitted_in(other: Session, name: str | None) -> tuple[Model, str]:
-    """Return the newest model in another log, of the given name if there is one, and its topic.
+    """Return the newest model in another log, and its topic; of the given name, or of a run of this name.
 
     Raises
     ------
     IpsysError
         There is no such model.
     """
-    for topic in reversed(_model_topics(other)):
-        model: Model = other.payloads([topic])[-1]
-        if name in (None, model.name):
+    models: list[Model] = []
+    for topic in reversed(topics := _model_topics(other)):
+        models.append(other.payloads([topic])[-1])
+        if name in (None, models[-1].name):
+            return models[-1], topic
+    for model, topic in zip(models, reversed(topics), strict=True):
+        if name == run_of_topic(topic):
             return model, topic
-    wanted = f"model {name}" if name else "model"
-    option = f" --model {name}" if name else ""
-    raise IpsysError(
-        f"{other}: has no fitted {wanted}; to fit one: "
-        f"ipsys replay {shell_words(*other.paths)} --until fit{option}"
-    )
+    wanted, option = (f"model {name}", f" --model {name}") if name else ("model", "")
+    known = f" (it has: {', '.join(dict.fromkeys(model.name for model in models))})" if models else ""
+    fit = f"; to fit one: ipsys replay {shell_words(*other.paths)} --until fit{option}"
+    is_fittable = name is None or is_known(name)
+    raise IpsysError(f"{other}: has no fitted {wanted}{known}{fit if is_fittable else ''}")
 
 
 def _model_topics(session: Session) -> list[str]:
@@ -156,7 +119,7 @@ def _model_topics(session: Session) -> list[str]:
     return [topic for run, written in runs for topic in session.topics(MODEL, run) if topic in written]
 
 
-def _copied_models(session: Session) -> tuple[str, ...]:
+def copied_models(session: Session) -> tuple[str, ...]:
     """Return the names of the models that were copied into a log without measurements, oldest first."""
     if has_measurements(LogView(session)):
         return ()

@@ -41,6 +41,7 @@ from ipsys_log.messages.channels import (
     TRUTH,
     Channel,
 )
+from ipsys_log.models.tracking.track_messages import begins_track
 from ipsys_log.statistics.calibration_points import build_pairs, gather_sightings, valid_measurements
 
 if TYPE_CHECKING:
@@ -177,6 +178,7 @@ def _item_parts(
     has_camera = "{camera}" in table.channel.topic
     by_topic = {topic: camera_of_topic(topic) for topic in topics}
     messages = session.encoded(topics, start_ns, end_ns)
+    segments = _Segments()
     is_first = True
     while (batch := list(islice(messages, _BATCH))) or is_first:
         is_first = False
@@ -187,7 +189,29 @@ def _item_parts(
             columns = read_columns(schema_name(table.payload), encoded, table.fields, items)
         except LogError as error:
             raise LogError(f"{session}: {table.channel.name}: {error}") from error
-        yield _part(columns, times.reshape(-1, 2), cameras, table)
+        part = _part(columns, times.reshape(-1, 2), cameras, table)
+        yield segments.add(part) if "robot" in part else part
+
+
+class _Segments:
+    """The numbers of the unbroken tracks of a table, over its parts."""
+
+    def __init__(self) -> None:
+        self._count = 0
+        self._last: dict[tuple[str, int], tuple[int, int]] = {}  # time and number, by robot and marker
+
+    def add(self, part: dict[str, Any]) -> dict[str, Any]:
+        """Return a part of a table with the column ``segment``."""
+        times_ns, numbers = part["time"].tolist(), []
+        keys = zip(part["robot"], part["marker_id"].tolist(), strict=True)
+        ages_ns = part.get("age_ns", [None] * len(times_ns))
+        for key, time_ns, age_ns in zip(keys, times_ns, ages_ns, strict=True):
+            last_ns, number = self._last.get(key, (0, -1))
+            if number < 0 or begins_track(time_ns - last_ns, age_ns):
+                number, self._count = self._count, self._count + 1
+            self._last[key] = time_ns, number
+            numbers.append(number)
+        return {**part, "segment": np.array(numbers, np.int64)}
 
 
 def _part(

@@ -43,12 +43,12 @@ from ipsys_log.capture.recorder import CameraSource, Recording, open_recording, 
 from ipsys_log.engine.checks import check_inputs
 from ipsys_log.engine.execute import one_blas_thread, sign
 from ipsys_log.engine.graph import stages_until
+from ipsys_log.engine.model_choice import choose_models
 from ipsys_log.engine.output import open_target
 from ipsys_log.engine.pieces import PieceWorkers
 from ipsys_log.engine.provenance import Outcome
 from ipsys_log.engine.replay import Replay
-from ipsys_log.engine.request import Progress, Request, evaluated_models, wanted_models
-from ipsys_log.engine.states import continue_newest
+from ipsys_log.engine.request import Progress, Request
 from ipsys_log.engine.stream import Route, WiredStage, in_threads, run
 from ipsys_log.engine.workers import LocalWorkers, check_jobs
 from ipsys_log.errors import IpsysError, LogError
@@ -56,7 +56,7 @@ from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.known_contents import one_reading
 from ipsys_log.log.location import LogLocation
 from ipsys_log.messages import Message
-from ipsys_log.messages.channels import EVALUATION, channel_of
+from ipsys_log.messages.channels import channel_of
 from ipsys_log.messages.events import CONTRADICTIONS
 from ipsys_log.plain_text import shell_words
 from ipsys_log.sinks.sink import FanOut, Sink
@@ -98,15 +98,14 @@ def replay(
     """
     check_jobs(jobs)
     stages = stages_until(until)
-    if until is not None:
-        request = continue_newest(request, paths, stages[-1])
-    usual = evaluated_models(paths) if EVALUATION in stages[-1].writes else ("poly",)
-    models = wanted_models(request, paths, usual)
-    check_inputs(paths, request, models, stages)
+    choice = choose_models(request, paths, stages[-1])
+    for line in check_inputs(paths, choice.request, choice.models, stages):
+        say(line)
     if workers is not None and workers.first_only and len(stages) > 1:
-        request, stages = replace(request, run=None), stages[:1]  # the given name is for the last stage
+        # The given name is for the last stage.
+        choice, stages = choice._replace(request=replace(choice.request, run=None)), stages[:1]
     with open_target(paths, output) as (logs, target), LocalWorkers(jobs) as local:
-        work = Replay(request, stages, models, logs, target, workers or local, local, progress, say)
+        work = Replay(choice, stages, logs, target, workers or local, local, progress, say)
         work.compute()
     return work.outcomes
 
@@ -192,7 +191,7 @@ def measure(
 def live(
     cameras: CameraSource,
     settings: Sequence[Message],
-    target: Path,
+    target: Path | None,
     request: Request,
     until: str | None = None,
     sinks: Sequence[Sink] = (),
@@ -207,6 +206,7 @@ def live(
     ----------
     cameras : live cameras, or simulated ones with a simulated clock.
     settings : written first: rig and camera intrinsics.
+    target : the new log; None: nothing is recorded.
     request : corners, method and, for stages that read a model, ``model_from``.
     until : the last stage, such as detect or camera-frame; None: all causal stages.
     sinks : each gets every frame that the stages have processed, and their results, after the write.
@@ -223,6 +223,8 @@ def live(
         The first error of ``sinks``, after the log is complete: it cannot end the recording.
     """
     plan = plan_live(cameras.states, settings, request, until)
+    if plan.reason:
+        cameras.say(plan.reason)
     first = (*settings, *plan.copies(cameras.now_ns))
     knocks = knock_events(plan.rig, cameras.add_event)
     with (
@@ -235,12 +237,19 @@ def live(
         arriving, events = _begin(frames, resources), frames.take_events
         ledger = Ledger(cameras.clock.now_ns, cameras.received_ns)
         fault = _put_through(chain(settings, arriving), plan.stages, ledger, log, show, events)
-        if fault is not None:
+        if fault is not None and target is not None:
             cameras.add_event("stages_stopped", f"{fault}; the recording continues")
             for message in arriving:
                 show(*events(), message)
         show(*events())
     log.check_file()
+    if target is None:
+        if fault is not None:
+            raise fault
+        if frames.skipped:
+            cameras.say(f"{frames.skipped.total()} frames skipped: processing could not keep up")
+        show.check()
+        return [Outcome(one.stage.name, one.run, True) for one in plan.runs]
     if fault is not None:
         raise IpsysError(
             f"{fault}; {target} has all frames; to process them: ipsys replay {shell_words(target)}"

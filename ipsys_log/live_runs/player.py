@@ -19,6 +19,7 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.log.location import LogLocation
 from ipsys_log.messages import Message, Rig, Track, Tracks
 from ipsys_log.messages.rig_file import check_robots
+from ipsys_log.plain_text import join_names
 from ipsys_log.sinks.playback import Playback, PlaybackOptions, in_capture_order
 from ipsys_log.sinks.selection import (
     PlayedScene,
@@ -49,6 +50,10 @@ class LiveTracks(NamedTuple):
     run: str
     time_ns: int
     tracks: tuple[Track, ...]
+
+    def __repr__(self) -> str:
+        robots = join_names([f"{t.robot} ({t.x_m:.3f}, {t.y_m:.3f}, {t.z_m:.3f}) m" for t in self.tracks])
+        return f"<LiveTracks of run {self.run} at {self.time_ns} ns: {robots or 'no robots'}>"
 
 
 class Tracker:

@@ -16,6 +16,8 @@ ASSUMED_MODEL = "assumed_lens_model"
 CALIBRATION_CONTRADICTED = "calibration_contradicted"
 # The kind of an event for a camera that was knocked during a live recording.
 CAMERA_MOVED = "camera_moved"
+# The kind of an event for a model whose cameras place the same robot far apart.
+MODEL_CONTRADICTED = "model_contradicted"
 # The kinds of events for a marker whose corners contradict its height in the rig, and for a tilted marker
 # whose camera point assumes that it is parallel to the image.
 CONTRADICTED_HEIGHT, TILTED_MARKER = "contradicted_height", "tilted_marker"

@@ -36,6 +36,9 @@ class Message:
     payload: Any
     camera: str | None = None
 
+    def __repr__(self) -> str:
+        return f"<Message {self.topic} at {self.log_time_ns} ns: {type(self.payload).__name__}>"
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Encoded:

@@ -125,7 +125,7 @@ class Rig:
 
     @property
     def is_simulated(self) -> bool:
-        """Whether all cameras are those of the simulated lab."""
+        """True if all cameras are those of the simulated lab."""
         return bool(self.cameras) and all(str(one.source).startswith("sim:") for one in self.cameras)
 
     def camera(self, name: str) -> RigCamera:

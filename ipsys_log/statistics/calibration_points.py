@@ -17,16 +17,17 @@ from ipsys_log.units import NS_PER_S
 # above the noise of plain sub-pixel corners (about 1 mm across and 5 mm along the view at 2 m).
 STILL_ACROSS_M = 0.01
 STILL_ALONG_M = 0.04
+# The number of calibration points for errors of millimetres with a drive, and of a centimetre without one.
+ENOUGH_DRIVE_POINTS = 4
+ENOUGH_TAPE_POINTS = 15
+ENOUGH_POINTS = (
+    f"{ENOUGH_DRIVE_POINTS} with a drive, or {ENOUGH_TAPE_POINTS} for each camera with the tape alone"
+)
 # In a longer gap of the sightings, the marker may have moved.
 LONGEST_GAP_NS = 2 * NS_PER_S
 _FARTHEST_M = 10_000.0
 # Heights with smaller differences are equal: the accuracy of a ruler and of uneven boards.
 _ONE_HEIGHT_M = 0.005
-# Enough calibration points: for all cameras together after a drive, where a fourth point shows a wrong one;
-# for each camera with the tape alone, where a polynomial of 10 terms needs some more.
-ENOUGH_POINTS = 4
-ENOUGH_TAPE_POINTS = 15
-ENOUGH_TEXT = f"{ENOUGH_POINTS} with a drive; {ENOUGH_TAPE_POINTS} for each camera with the tape alone"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

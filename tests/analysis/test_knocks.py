@@ -13,6 +13,7 @@ from ipsys_log.capture.live_check import Knock, KnockMonitor
 from ipsys_log.capture.simulation.cameras import mount_cameras
 from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.messages import Marker, Markers, Message, Position, Positions, ReferenceMarker, Rig
+from ipsys_log.messages.events import MODEL_CONTRADICTED
 from ipsys_log.statistics.floor_cameras import shift_floor_map
 from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.lenses import in_image, project
@@ -105,6 +106,16 @@ def test_knocked_camera_is_named_within_a_second(rate_hz: float) -> None:
     assert knock.camera == "white"
     assert AT_S < knock.time_ns / NS_PER_S < AT_S + 1.0
     assert "camera white has moved" in knock.text
+
+
+def test_model_of_another_lab_is_named_once_for_each_pair() -> None:
+    """The model has each camera where it hung in the other lab: positions are turned about the camera."""
+    turned = {"black": 0.0, "red": 0.3, "white": 0.1}
+    knocks = warnings(positions(lambda camera, _: np.array([0, turned[camera], 0, 0, 0, 0]), 8.0))
+    assert {knock.kind for knock in knocks} == {MODEL_CONTRADICTED}
+    pairs = sorted(knock.text.split(" place ")[0] for knock in knocks)
+    assert pairs == ["cameras black and red", "cameras black and white", "cameras red and white"]
+    assert max(knock.time_ns for knock in knocks) < 2 * NS_PER_S
 
 
 def test_still_cameras_cause_no_warning() -> None:

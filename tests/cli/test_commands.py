@@ -70,6 +70,8 @@ OLD_FORMS = [
     ("latency a.mcap --plot a.png", "info --latency a.mcap --plot a.png"),
     ("diff a.mcap b.mcap --run poly", "verify --compare a.mcap b.mcap --run poly"),
     ("diff a.mcap --run poly --run best", "verify --compare a.mcap --run poly --run best"),
+    ("evaluate a.mcap --plots figures", "evaluate a.mcap --plot figures"),
+    ("replay a.mcap --plots=figures", "replay a.mcap --plot=figures"),
     ("compact a.mcap --dry-run", "cut --compact a.mcap --dry-run"),
     ("detect a.mcap --corners stock", "replay --until detect a.mcap --corners stock"),
     ("camera-frame a.mcap", "replay --until camera-frame a.mcap"),

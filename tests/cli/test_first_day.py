@@ -106,6 +106,7 @@ def test_bad_source_or_calibration_is_reported_first(
         (("record", "-o", "a.mcap", "--measure", "--host", "192.0.2.1"), "cannot listen on this address"),
         (("live", "-o", "a.mcap", "--model-from", "none.mcap"), "none.mcap"),
         (("live", "-o", "a.mcap", "--model-from", "FITTED", "--model", "best"), "has no fitted model best"),
+        (("live", "-o", "a.mcap"), "no fitted model is given"),
         (("live", "-o", "old.mcap", "--model-from", "FITTED"), "old.mcap: exists already"),
         (("align", "-o", "old.mcap"), "old.mcap: exists already"),
         (("align", "--plot", "none/a.png"), "there is no folder none"),

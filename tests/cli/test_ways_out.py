@@ -40,6 +40,16 @@ def test_view_saved_under_another_ending_is_refused(ipsys: Ipsys, lab: Path) -> 
     assert "there is no folder" in refused(ipsys, lab, "view", lab, "--save", lab.with_name("no") / "out.rrd")
 
 
+def test_view_saves_a_picture_of_the_tracks(ipsys: Ipsys, replayed_log: Path, tmp_path: Path) -> None:
+    assert ipsys("view", replayed_log, "-o", tmp_path / "with.svg").code == 0
+    assert ipsys("view", PAPER_LAB, "-o", tmp_path / "without.svg").code == 0
+    lines = [(tmp_path / name).read_text().count("line2d") for name in ("with.svg", "without.svg")]
+    assert lines[0] > lines[1]
+    assert "has no run 'x'" in refused(
+        ipsys, replayed_log, "view", replayed_log, "--run", "x", "-o", tmp_path / "x.png"
+    )
+
+
 @pytest.mark.parametrize("command", [("images",), ("imsel",), ("videos",)])
 def test_import_of_a_log_names_what_to_run(ipsys: Ipsys, lab: Path, command: tuple[str]) -> None:
     # a log by its bytes, with any file name

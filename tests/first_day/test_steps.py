@@ -182,7 +182,7 @@ def test_points_are_enough_at_the_number_of_the_docs(
     progress = read_progress(folder)
     step = progress.step("points")
     assert step.status is status
-    assert ("4 with a drive; 15 for each camera with the tape alone" in step.text) == (status is R)
+    assert ("4 with a drive, or 15 for each camera with the tape alone" in step.text) == (status is R)
     # The tape alone needs no drive.
     assert progress.step("drive").status is (R if status is R and not drive_s else D)
 

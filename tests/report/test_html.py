@@ -215,6 +215,10 @@ def test_page_fits_screens_and_follows_the_colour_scheme(page: str, tmp_path: Pa
     with phone(tmp_path / "browser") as browser:
         for size in ((390, 844), (1280, 800)):
             browser.open(file.as_uri(), size)
+            # Six screens of 1280 x 900 px with folded details; a link opens its section.
+            assert size[0] < 1280 or browser.run("document.documentElement.scrollHeight") <= 6 * 900
+            browser.run("location.hash = 'tape'")
+            assert browser.run("document.querySelector('#tape').closest('details')?.open") is True
             browser.run("document.querySelectorAll('details').forEach(part => part.open = true)")
             assert browser.run("document.scrollingElement.scrollWidth <= innerWidth")
             tables = browser.run(TABLES)

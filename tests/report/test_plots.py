@@ -1,4 +1,4 @@
-"""The files of ``--plots``: the numbers of the JSON, and legible figures."""
+"""The files of ``--plot`` into a folder: the numbers of the JSON, and legible figures."""
 
 from __future__ import annotations
 
@@ -185,11 +185,11 @@ def test_bad_folders_are_refused_before_anything_is_done(ipsys: Ipsys, tmp_path:
     # No user can create a file in /proc.
     elsewhere = [Path("/proc/plots")] if Path("/proc").is_dir() else []
     for target in (tmp_path / "file", tmp_path / "file" / "in_it", log, *elsewhere):
-        done = ipsys("evaluate", log, "--model", "rigid", "--plots", target)
+        done = ipsys("evaluate", log, "--model", "rigid", "--plot", target)
         assert done.code == 1
         assert done.out == ""
         assert len(done.err.splitlines()) == 1
-        assert "--plots" in done.err
+        assert "--plot" in done.err
     done = ipsys("replay", log, "--model", "rigid", "--plot", log)
     assert done.code == 1
     assert "is not a figure file" in done.err
@@ -202,7 +202,7 @@ def test_a_folder_in_the_way_leaves_the_other_files_as_they_were(ipsys: Ipsys, t
     log, plots = tmp_path / "lab.mcap", tmp_path / "plots"
     write_log(log, lab_messages())
     (plots / "models.png").mkdir(parents=True)
-    done = ipsys("evaluate", log, "--model", "rigid", "--plots", plots)
+    done = ipsys("evaluate", log, "--model", "rigid", "--plot", plots)
     assert done.code == 1
     assert "models.png: is a folder" in done.err
     assert [path.name for path in plots.iterdir()] == ["models.png"]
@@ -211,7 +211,7 @@ def test_a_folder_in_the_way_leaves_the_other_files_as_they_were(ipsys: Ipsys, t
 def test_log_without_points_is_refused_and_no_file_is_written(ipsys: Ipsys, tmp_path: Path) -> None:
     log = tmp_path / "few.mcap"
     write_log(log, lab_messages(count=4))
-    for command in (("evaluate", log, "--plots", tmp_path / "plots"), ("report", log)):
+    for command in (("evaluate", log, "--plot", tmp_path / "plots"), ("report", log)):
         done = ipsys(*command)
         assert done.code == 1
         assert len(done.err.splitlines()) == 1
@@ -223,7 +223,7 @@ def test_evaluate_writes_them(ipsys: Ipsys, tmp_path: Path) -> None:
     log = tmp_path / "lab.mcap"
     write_log(log, lab_messages())
     done = ipsys(
-        "evaluate", log, "--model", "poly", "--model", "best", "--plots", tmp_path / "plots", "--json"
+        "evaluate", log, "--model", "poly", "--model", "best", "--plot", tmp_path / "plots", "--json"
     )
     assert done.code == 0, done.err
     found = json.loads(done.out)
@@ -231,6 +231,18 @@ def test_evaluate_writes_them(ipsys: Ipsys, tmp_path: Path) -> None:
     assert found["recommendation"]["sentences"]
     assert (tmp_path / "plots/models.png").stat().st_size > 1000
     assert f"{tmp_path / 'plots'} has table_1.csv" in done.err
+
+
+def test_plot_is_a_file_a_folder_or_a_format_of_a_folder(ipsys: Ipsys, tmp_path: Path) -> None:
+    log = tmp_path / "lab.mcap"
+    write_log(log, lab_messages())
+    plots = [word for to in ("floor.svg", "pdf/*.pdf") for word in ("--plot", tmp_path / to)]
+    assert ipsys("evaluate", log, "--model", "rigid", *plots, "--plots", tmp_path / "png").code == 0
+    assert (tmp_path / "floor.svg").read_bytes().startswith(b"<?xml")
+    names = {suffix: {path.name for path in (tmp_path / suffix).iterdir()} for suffix in ("pdf", "png")}
+    assert "models.png" in names["png"] >= {"table_1.csv"}
+    assert names["pdf"] == {name.replace(".png", ".pdf") for name in names["png"]}
+    assert (tmp_path / "pdf/models.pdf").read_bytes().startswith(b"%PDF")
 
 
 def test_learning_curve_marks_are_at_their_number_of_points(paper: Findings) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import replace as with_changes
 from pathlib import Path
 
 import pytest
@@ -29,6 +30,8 @@ from ipsys_log.tools.verify import verify
 from tests.conftest import ROOT, Ipsys, data_section
 from tests.runs import damping
 from tests.runs.damping import DAMPED_TRACKS
+
+POLY = Request(models=("poly",))
 
 
 @pytest.fixture
@@ -105,7 +108,7 @@ def test_stages_until_gives_the_needed_stages() -> None:
 
 
 def test_stage_of_one_row_and_one_channel_is_replayed(ipsys: Ipsys, whole: Path, with_damping: None) -> None:
-    outcomes = replay([whole], Request())
+    outcomes = replay([whole], POLY)
     assert [(one.stage, one.run) for one in outcomes[-2:]] == [("fuse", "poly"), ("damp", "poly")]
     with Session([whole]) as session:
         tracks = session.payloads(session.topics(TRACKS, "poly"))
@@ -119,22 +122,22 @@ def test_stage_of_one_row_and_one_channel_is_replayed(ipsys: Ipsys, whole: Path,
 
 
 def test_stage_of_one_payload_type_is_done_once(whole: Path, with_damping: None) -> None:
-    assert [one.stage for one in replay([whole], Request()) if one.fresh] == ["damp"]
+    assert [one.stage for one in replay([whole], POLY) if one.fresh] == ["damp"]
     before = data_section(whole)
-    assert not any(one.fresh for one in replay([whole], Request()))
+    assert not any(one.fresh for one in replay([whole], POLY))
     assert data_section(whole) == before
 
 
 def test_parameter_of_an_added_stage_makes_another_run(whole: Path, with_damping: None) -> None:
-    replay([whole], Request())
-    again = replay([whole], Request(parameters={"weight": "0.25"}))
+    replay([whole], POLY)
+    again = replay([whole], with_changes(POLY, parameters={"weight": "0.25"}))
     assert [(one.stage, one.run) for one in again if one.fresh] == [("damp", "poly_2")]
 
 
 def test_row_of_an_added_stage_does_not_change_the_others(
     log: Path, replayed_log: Path, with_damping: None
 ) -> None:
-    replay([log], Request())
+    replay([log], POLY)
     with Session([log]) as ours, Session([replayed_log]) as theirs:
         topics = ["/runs/poly/tracks", "/runs/poly/poses", "/runs/edges/cameras/red/markers"]
         assert [ours.hash(topic) for topic in topics] == [theirs.hash(topic) for topic in topics]

@@ -54,7 +54,7 @@ class Case:
 
     said: str
     change: Change = lambda message: message
-    command: str = "replay LOG"
+    command: str = "replay LOG --model poly"
     log: str = "paper"
     before: str = ""
     late: bool = False
@@ -136,6 +136,7 @@ OTHER_CAMERAS = edit(
         model, cameras=tuple(replace(one, camera=f"{one.camera}_old") for one in model.cameras)
     ),
 )
+WIDE = np.array([[0.9, 1, 1], [1, 0.9, 1], [1, 1, 1]])
 MODEL_FROM = "replay LOG --model-from MODEL"
 A, B = Distance("A", 2.0), Distance("B", 2.0)
 
@@ -204,7 +205,14 @@ CASES: dict[str, Case] = {
     # Models of other logs.
     "no_such_model": Case(said="has no fitted model best", command="fit LOG --model best --model-from MODEL"),
     "no_such_model_live": Case(said="has no fitted model best", command=f"{MODEL_FROM} --model best"),
+    "no_format": Case(said="-o NAME.mp4 (a video)", command="export LOG"),
+    "no_point": Case(said="has no calibration point 'p9'", command="exclude LOG p9"),
+    "no_reason": Case(said="--reason: is missing", command="exclude LOG s001"),
     "other_cameras": Case(said="model is for the cameras", command=MODEL_FROM, change_model=OTHER_CAMERAS),
+    "other_lenses": Case(
+        said="this is a model of other cameras; calibrate this lab", command=MODEL_FROM,
+        change=edit(CameraCalibration, lambda lens: replace(lens, K=lens.K * WIDE)),
+    ),
     "incomplete_model": Case(
         said="the stored model poly has no parameter", command=MODEL_FROM, change_model=NO_PARAMETERS
     ),
@@ -221,7 +229,7 @@ def model_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from ipsys_log.live_runs.pipeline import replay
 
     path = Path(shutil.copy(PAPER, tmp_path_factory.mktemp("model") / "model.mcap"))
-    replay([path], Request(), "fit")
+    replay([path], Request(models=("poly",)), "fit")
     return path
 
 

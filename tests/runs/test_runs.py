@@ -41,7 +41,7 @@ def replayed_paper(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     def write(folder: Path) -> None:
         shutil.copy(PAPER, folder / "paper.mcap")
-        pipeline.replay([folder / "paper.mcap"], Request())
+        pipeline.replay([folder / "paper.mcap"], Request(models=("poly",)))
 
     return make_once(tmp_path_factory, "paper", write) / "paper.mcap"
 
@@ -112,7 +112,10 @@ def test_run_of_last_log_is_newest_whatever_its_number(ipsys: Ipsys, paper: Path
     """With two results of one recording, that of the last log counts."""
     low, high = tmp_path / "low.mcap", tmp_path / "high.mcap"
     ipsys("camera-frame", paper)
-    assert runs_of(ipsys, "replay", paper, "-o", low, "--run", "low")["fuse"] == ("low", True)
+    assert runs_of(ipsys, "replay", paper, "-o", low, "--run", "low", "--model", "poly")["fuse"] == (
+        "low",
+        True,
+    )
     assert runs_of(ipsys, "replay", paper, low, "-o", high, "--run", "high")["fuse"] == ("high", True)
     assert runs_of(ipsys, "replay", paper, low, high)["fuse"] == ("high", False)
     assert runs_of(ipsys, "replay", paper, high, low)["fuse"] == ("low", False)
@@ -142,7 +145,7 @@ def test_topics_without_a_record_are_ignored(ipsys: Ipsys, replayed: Path) -> No
     with Session([log]) as session:
         topics = [t for r in session.readers for t in r.channels if run_of_topic(t) == "poly"]
         before = {t: session.count(t) for t in topics if not t.endswith("/record")}
-    made = runs_of(ipsys, "replay", log)
+    made = runs_of(ipsys, "replay", log, "--model", "poly")
     assert {made[stage] for stage in ("fit", "evaluate", "locate", "fuse")} == {("poly_2", True)}
     with Session([log]) as session:
         assert {t: session.count(t) for t in before} == before
@@ -150,7 +153,7 @@ def test_topics_without_a_record_are_ignored(ipsys: Ipsys, replayed: Path) -> No
 
 def test_a_run_that_lost_a_channel_is_not_complete(ipsys: Ipsys, replayed: Path) -> None:
     log = without(replayed, lambda m: m.topic == "/runs/poly/cameras/red/positions")
-    made = runs_of(ipsys, "replay", log)
+    made = runs_of(ipsys, "replay", log, "--model", "poly")
     assert made["evaluate"] == ("poly", False)
     assert made["locate"] == ("poly_2", True)
     assert made["fuse"] == ("poly_2", True)
@@ -201,7 +204,7 @@ def test_a_camera_that_the_model_does_not_know_is_named(ipsys: Ipsys, paper: Pat
         record = next(run for run in session.runs() if run.stage == "detect")
     kept = tuple(o for o in record.outputs if "/red/" not in o.topic)
     two = change(two, lambda p: replace(p, outputs=kept) if isinstance(p, Run) else p)
-    assert ipsys("replay", two).code == 0
+    assert ipsys("replay", two, "--model", "poly").code == 0
     done = ipsys("replay", paper, "--model-from", two)
     assert done.code == 0
     assert "camera red has no model" in done.err
@@ -210,7 +213,7 @@ def test_a_camera_that_the_model_does_not_know_is_named(ipsys: Ipsys, paper: Pat
 def test_model_contains_its_calibration_points(ipsys: Ipsys, paper: Path, tmp_path: Path) -> None:
     plain = change(paper, lambda p: replace(p, splits=()) if hasattr(p, "splits") else p)
     fitted = tmp_path / "fitted.mcap"
-    assert ipsys("fit", plain, "-o", fitted).code == 0
+    assert ipsys("fit", plain, "-o", fitted, "--model", "poly").code == 0
     done = ipsys("evaluate", plain, "--model-from", fitted, "--json")
     assert done.code == 0, done.err
     counts = {c: e["3d"]["count"] for c, e in json.loads(done.out)["models"]["poly"]["cameras"].items()}
@@ -279,7 +282,7 @@ def test_points_that_no_camera_saw_are_named(ipsys: Ipsys, paper: Path) -> None:
             return replace(payload, still=None, timestamp=payload.timestamp + 10**15)
         return payload
 
-    done = ipsys("fit", change(paper, late))
+    done = ipsys("fit", change(paper, late), "--model", "poly")
     assert "calibration points have no stationary interval in any camera: s003" in done.err
 
 
@@ -287,7 +290,7 @@ def test_the_truth_is_compared_only_where_it_is_known(ipsys: Ipsys, paper: Path)
     with Session([paper]) as session:
         middle = (session.start_ns + session.end_ns) // 2
     log = without(paper, lambda m: isinstance(m.payload, Tracks) and m.log_time_ns < middle)
-    cameras = json.loads(ipsys("replay", log, "--json").out)["models"]["poly"]["cameras"]
+    cameras = json.loads(ipsys("replay", log, "--model", "poly", "--json").out)["models"]["poly"]["cameras"]
     for errors in cameras.values():
         assert "truth" not in errors or errors["truth"]["3d"]["count"] < errors["3d"]["count"]
         assert "truth" not in errors or errors["truth"]["3d"]["mean_m"] < 0.02

@@ -14,8 +14,10 @@ import pytest
 from ipsys_log.api import python_api as api
 from ipsys_log.api.python_api import load_model
 from ipsys_log.capture.simulation.settings import LabSettings
+from ipsys_log.engine.graph import stages_until
+from ipsys_log.engine.model_choice import choose_models, newest_model
 from ipsys_log.engine.output import write_log
-from ipsys_log.engine.request import Request, evaluated_models
+from ipsys_log.engine.request import Request
 from ipsys_log.errors import FitError, IpsysError
 from ipsys_log.live_runs.survey.checks import check_entry
 from ipsys_log.live_runs.survey.entry import TypedEntry, parse_entry
@@ -254,27 +256,52 @@ def test_wrong_tape_reading_is_an_outlier_of_joint(ipsys: Ipsys, tmp_path: Path)
     assert "Outliers: measure 1 point again" in ipsys("evaluate", log, "--model", "joint").out
 
 
-def test_usual_models_have_joint_where_there_are_corners(calibration: Path, tmp_path: Path) -> None:
+def test_models_are_the_best_that_a_log_allows(calibration: Path, tmp_path: Path) -> None:
     points_only = tmp_path / "points.mcap"
     with Session([calibration]) as session:
         topics = [t for reader in session.readers for t in reader.channels if "/markers" not in t]
-        messages = [m for m in session.messages(topics) if not isinstance(m.payload, Run)]
-    write_log(points_only, messages)
-    assert evaluated_models([calibration]) == (*MODELS, "joint")
-    assert evaluated_models([points_only]) == tuple(MODELS)
+        write_log(points_only, (m for m in session.messages(topics) if not isinstance(m.payload, Run)))
+        (rig,) = session.payloads(session.topics(RIG))
+    evaluate, fuse = (stages_until(name)[-1] for name in ("evaluate", None))
+    assert choose_models(Request(), [calibration], evaluate).models == (*MODELS, "joint")
+    assert choose_models(Request(), [points_only], evaluate).models == tuple(MODELS)
+    no_height = replace(rig, marker_height_m=None)
+    said = {
+        (calibration, None): ("joint", "model joint: the log has markers and their heights"),
+        (points_only, None): ("best", "joint needs images or markers"),
+        (calibration, no_height): ("best", "joint needs marker_height_m of marker 0 in the rig"),
+    }
+    for (log, given), (model, reason) in said.items():
+        choice = choose_models(Request(rig=given), [log], fuse)
+        assert choice.models == (model,)
+        assert reason in choice.reason
 
 
-def test_usual_joint_model_that_cannot_be_fitted_is_left_out(
+def test_newest_run_of_the_user_is_continued(ipsys: Ipsys, fitted: Path) -> None:
+    """Later evaluations of all models do not select one."""
+    assert ipsys("replay", fitted, "--model", "rigid", "--seed", 3).code == 0
+    assert ipsys("evaluate", fitted, "--model", "rayplane", "--model", "best").code == 0
+    done = ipsys("replay", fitted)
+    assert "model rigid: that of the newest run" in done.err
+    assert "nothing to do" in done.err
+    with Session([fitted]) as session:
+        assert newest_model(session) == "rigid"
+
+
+def test_default_joint_model_that_cannot_be_fitted_is_replaced(
     ipsys: Ipsys, log: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_arguments: object) -> Model:
         raise FitError("camera red: no overlap")
 
-    monkeypatch.setattr("ipsys_log.live_runs.pipeline.evaluated_models", lambda paths: ("rigid", "joint"))
+    monkeypatch.setattr("ipsys_log.engine.model_choice.MODELS", ("rigid",))
     monkeypatch.setattr("ipsys_log.statistics.joint_evaluation.fit_joint_model", fail)
-    done = ipsys("evaluate", log)
-    assert done.code == 0, done.err
-    assert "joint is left out: camera red: no overlap" in done.err
+    for command, runs in (("replay", {"best"}), ("evaluate", {"best", "rigid"})):
+        done = ipsys(command, log)
+        assert done.code == 0, done.err
+        assert "joint is left out: camera red: no overlap" in done.err
+        with Session([log]) as session:
+            assert {run.run for run in session.runs()} - {"geometric"} == runs
     named = ipsys("evaluate", log, "--model", "joint")
     assert (named.code, named.err.count("\n")) == (1, 1)
 

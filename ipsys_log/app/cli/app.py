@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import functools
+import re
 import shlex
 from collections.abc import Callable, Iterator, Mapping
 from importlib import import_module
@@ -107,6 +108,7 @@ def present_words(words: list[str]) -> list[str]:
     >>> present_words(["simulate", "-o", "lab.mcap", "--drive-s", "4"])
     ['simulate', '-o', 'lab.mcap', '--set', 'drive_s=4']
     """
+    words = [re.sub("^--plots(?==|$)", "--plot", word) for word in words]
     name, *rest = words
     if name in _OLD_NAMES:
         return [*_OLD_NAMES[name], *rest]
@@ -161,7 +163,7 @@ class Commands(TyperGroup):
         """Return the name, the command and its words."""
         words = present_words(args)
         if words != args and remarks.is_terminal:
-            say(f"ipsys {args[0]} is an old name until the next release; now: ipsys {shlex.join(words)}")
+            say(f"old names work until the next release; now: ipsys {shlex.join(words)}")
         return super().resolve_command(ctx, words)
 
     def format_help(self, ctx: Any, formatter: Any) -> None:

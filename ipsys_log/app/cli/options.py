@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ipsys_log.app.cli.console import say
-from ipsys_log.app.report.files import check_figure_file
+from ipsys_log.app.report.files import check_figure_file, check_figures
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.location import LogLocation, LogUrl, parse_location
 from ipsys_log.stages import CORNERS, METHOD, StageParameter
@@ -193,9 +193,21 @@ def _figure_file(path: Path | None) -> Path | None:
     return path
 
 
-def figure_option(subject: str) -> Any:
-    """Return the description of the option ``--plot``."""
-    return setting("--plot", "FILE", f"Draw {subject}: .png, .pdf, .svg or .jpg.", callback=_figure_file)
+def _figure_files(paths: list[Path] | None) -> list[Path] | None:
+    """Return the files of figures, and the folders of all figures, after the same check."""
+    _refuse(paths, _NOT_HERE)
+    for path in paths or ():
+        check_figures(path, "--plot")
+    return paths
+
+
+def figure_option(subject: str, folder: str | None = None) -> Any:
+    """Return the description of the option ``--plot``; ``folder`` names the figures that a folder gets."""
+    text = f"Draw {subject}: .png, .pdf, .svg or .jpg."
+    if folder is None:
+        return setting("--plot", "FILE", text, callback=_figure_file)
+    text += f" DIR or 'DIR/*.svg': {folder}. Repeat it for several."
+    return setting("--plot", "FILE|DIR", text, callback=_figure_files)
 
 
 # The options that every command uses for the name of a new log.

@@ -88,9 +88,9 @@ def plan_dashboard(
         return None
     import ipsys_log.app.web.dashboard.app  # noqa: F401
     from ipsys_log.engine.graph import copy_model
-    from ipsys_log.engine.request import wanted_models
+    from ipsys_log.engine.model_choice import applied_models
 
-    first, *_ = wanted_models(request)
+    first, *_ = applied_models(request)[0]
     return DashboardPlan(host, port, copy_model(request, first)[1])
 
 

@@ -137,7 +137,9 @@ def exclude(
     points: Annotated[
         list[str], typer.Argument(metavar="POINT", help="Names of calibration points, such as p007.")
     ],
-    reason: Annotated[str, setting("--reason", "TEXT", "The reason, which is written into the log.")],
+    reason: Annotated[
+        str, setting("--reason", "TEXT", "The reason, which is written into the log. Necessary.")
+    ] = "",
     readmit: Annotated[
         bool, switch("--readmit", "Use excluded points again, instead of excluding points.")
     ] = False,
@@ -175,11 +177,7 @@ def show_measured(
     log: Path, added: Sequence[Measurement], history: Sequence[Measurement], as_json: bool
 ) -> None:
     """Print the number of added measurements, and the next step for the points that a log has now."""
-    from ipsys_log.statistics.calibration_points import (
-        ENOUGH_TAPE_POINTS,
-        ENOUGH_TEXT,
-        active_measurements,
-    )
+    from ipsys_log.statistics.calibration_points import ENOUGH_POINTS, active_measurements
 
     withdrawn = sum(measurement.withdraws is not None for measurement in added)
     count = sum(measurement.is_point for measurement in added)
@@ -191,10 +189,9 @@ def show_measured(
         also += f", {withdrawn} withdrawn" if withdrawn else ""
         console.print(f"{counted(count, 'point')} measured into {log}{also}")
     active = len(active_measurements(history))
-    if 0 < active < ENOUGH_TAPE_POINTS:
-        say(f"calibration points in the log: {active}; enough are {ENOUGH_TEXT}")
     if active:
-        say(f"next: ipsys replay {shell_words(log)}")
+        say(f"calibration points in the log: {active}; enough: {ENOUGH_POINTS}")
+        say(f"next: ipsys calibrate-lab {shell_words(log)}")
 
 
 _MOST_PLACES = 50

@@ -226,9 +226,9 @@ def _ask_beside(work: Callable[[], Any], scene: LiveScene, cameras: LiveCameras)
 def live(
     output: cli.NewLog,
     model_from: Annotated[
-        cli.OneLog,
+        cli.OtherLog,
         other_log_option("--model-from", help="The log with the fitted model to apply, a file or a URL."),
-    ],
+    ] = None,
     rig: cli.RigNow = Path("lab.toml"),
     model: cli.FittedModels = None,
     camera: cli.Only = None,
@@ -264,7 +264,7 @@ def live(
     if web:
         check_installed("--web needs", "starlette", "uvicorn")
     lab = prepare_lab(rig, camera, calibration)
-    check_target(output, force, [*lab.files, (MODEL, model_from)])
+    check_target(output, force, [*lab.files, *([(MODEL, model_from)] if model_from else [])])
     models = tuple(dict.fromkeys(model or ()))
     request = Request(models=models, model_from=model_from, corners=corners, method=method)
     for line in check_start(lab.rig, lab.names, lab.lenses, request, None):

@@ -22,9 +22,8 @@ from ipsys_log.app.cli.options import (
     with_options,
 )
 from ipsys_log.app.cli.signals import say_kept
-from ipsys_log.app.report.files import check_folder
+from ipsys_log.app.report.files import figure_folder
 from ipsys_log.errors import IpsysError
-from ipsys_log.extras import check_installed
 from ipsys_log.log.location import LogLocation, parse_location
 from ipsys_log.stages import ENTRIES, STAGE_NAMES, parameters_until
 
@@ -61,11 +60,16 @@ _SHARED: dict[str, cli.Option] = {
     "as_json": (cli.AsJson, False),
 }  # fmt: skip
 _PRINTS: dict[str, cli.Option] = {
-    "plot": (Annotated[Path | None, figure_option("the floor and the errors")], None),
+    "plot": (
+        Annotated[
+            list[Path] | None,
+            figure_option("the floor and the errors", "the paper's tables and figures, and more"),
+        ],
+        None,
+    ),
     "details": flag(
         "--details", "Print details, too: errors by camera, every outlier, models by number of points."
     ),
-    "plots": option(Path | None, "--plots", "DIR", "Write the paper's tables and figures, and more."),
 }
 # The order of options in the help. Parameters that are not in it come after these.
 _ORDER = (
@@ -79,15 +83,16 @@ _UNTIL = option(
 _REPLAY = f"""
 Run the missing stages of a log, append their results to it, and print the accuracy.
 
-With --until locate, fuse or smooth and without --model, the command continues the newest run, with its model
-and settings. These are all stages in their order; smooth only runs with --until smooth:
+Without --model, the command continues the newest run, with its model and settings. If there is none, it fits
+joint to a log with markers and their heights, and best to any other log; a line says why. These are all
+stages in their order; smooth only runs with --until smooth:
 
 {_stage_lines()}
 
 Examples
 
-    ipsys replay calibration.mcap                      # fit and evaluate poly
-    ipsys replay calibration.mcap --model best --plot floor.png
+    ipsys replay calibration.mcap                      # fit and evaluate the best model
+    ipsys replay calibration.mcap --model poly --plot floor.png    # the method of the paper
     ipsys replay monday.mcap --model-from calibration.mcap
     ipsys replay calibration.mcap --rig lab.toml       # with a corrected rig
     ipsys replay monday.mcap --until detect            # only the markers
@@ -104,7 +109,7 @@ Examples
 
     ipsys evaluate calibration.mcap                    # all models
     ipsys evaluate calibration.mcap --details          # with details
-    ipsys evaluate calibration.mcap --model poly --model best --plots figures
+    ipsys evaluate calibration.mcap --model poly --model best --plot figures
 """
 
 
@@ -232,16 +237,12 @@ def _derive(
     until: str | None,
     logs: Sequence[LogLocation],
     as_json: bool,
-    plot: Path | None = None,
-    plots: Path | None = None,
+    plot: Sequence[Path] | None = None,
     details: bool = False,
     **given: Any,
 ) -> None:
-    if plots is not None:
-        check_installed("--plots needs", "matplotlib")
-        check_folder(plots, "--plots")
     with derive(logs, until, **given) as (session, outcomes, accuracies):
-        drawn = _draw(session, accuracies, plot, plots)
+        drawn = [_draw(session, accuracies, path) for path in plot or ()]
     print_result(_result(outcomes, accuracies), _parts(accuracies, details), as_json)
     if accuracies and not (details or as_json):
         say("--details prints errors by camera, every outlier and models by number of points")
@@ -249,23 +250,17 @@ def _derive(
         say(line)
 
 
-def _draw(
-    session: Session, accuracies: Sequence[Accuracy], plot: Path | None, plots: Path | None
-) -> list[str]:
-    """Draw the requested figures; return a line for each figure."""
-    drawn = []
-    if plot is not None:
+def _draw(session: Session, accuracies: Sequence[Accuracy], path: Path) -> str:
+    """Draw a figure, or all figures into a folder; return a line about it."""
+    if (folder := figure_folder(path)) is None:
         from ipsys_log.app.report.floor_figure import draw_session
 
-        draw_session(session, accuracies, plot)
-        drawn.append(f"{plot} drawn")
-    if plots is not None:
-        from ipsys_log.app.report.findings import gather_findings
-        from ipsys_log.app.report.paper_figures import write_plots
+        draw_session(session, accuracies, path)
+        return f"{path} drawn"
+    from ipsys_log.app.report.findings import gather_findings
+    from ipsys_log.app.report.paper_figures import write_plots
 
-        names = write_plots(gather_findings(session, accuracies), plots)
-        drawn.append(f"{plots} has {', '.join(names)}")
-    return drawn
+    return f"{folder[0]} has {', '.join(write_plots(gather_findings(session, accuracies), *folder))}"
 
 
 def _result(outcomes: Sequence[Outcome], accuracies: Sequence[Accuracy]) -> dict[str, Any]:
@@ -304,5 +299,5 @@ _options = options_until(None)
 _json = _options.pop("as_json")
 _options = {"logs": _options.pop("logs"), "until": _UNTIL, **_options, **_PRINTS, "as_json": _json}
 replay = with_options(_options, "replay", _REPLAY)(_replay)
-_options = {**options_until("evaluate"), "plots": _PRINTS["plots"], "details": _PRINTS["details"]}
+_options = {**options_until("evaluate"), **_PRINTS}
 evaluate = with_options(_options, "evaluate", _EVALUATE)(partial(_derive, "evaluate"))

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 from ipsys_log.app.cli.console import console, progress_bar, say
 from ipsys_log.app.cli.options import ReadLogs, setting, switch, with_options
 from ipsys_log.app.cli.stages import derive, options_until
-from ipsys_log.app.report.files import check_file, write_files
+from ipsys_log.app.report.files import FIGURE_SUFFIXES, check_figure_file, check_file, write_files
 from ipsys_log.errors import IpsysError
 from ipsys_log.extras import check_installed
 from ipsys_log.log.location import LogLocation, file_beside
@@ -20,7 +20,13 @@ Runs = Annotated[
     list[str] | None, setting("--run", "NAME", "Show this run instead of the newest; repeat it for several.")
 ]
 Save = Annotated[
-    Path | None, setting("--save", "FILE", "Write a Rerun recording (.rrd) instead of opening the viewer.")
+    Path | None,
+    setting(
+        "--save,-o",
+        "FILE",
+        "Write a Rerun recording (.rrd), or a picture of the floor with the tracks (.png, .pdf, .svg or "
+        ".jpg), instead of opening the viewer.",
+    ),
 ]
 FoxgloveLayout = Annotated[
     Path | None,
@@ -58,7 +64,8 @@ def view(logs: ReadLogs, run: Runs = None, save: Save = None, foxglove_layout: F
     Examples
 
         ipsys view monday.mcap                             # the newest run
-        ipsys view monday.mcap --run poly --save monday.rrd
+        ipsys view monday.mcap --run poly -o monday.rrd
+        ipsys view monday.mcap -o floor.png
     """
     from ipsys_log.log.dataset import Session
 
@@ -66,13 +73,16 @@ def view(logs: ReadLogs, run: Runs = None, save: Save = None, foxglove_layout: F
         _write_layout(logs, run or (), foxglove_layout)
         if save is None:
             return
-    check_installed("view needs", "rerun")
     if save is not None:
+        if save.suffix.lower() in FIGURE_SUFFIXES:
+            _draw_floor(logs, run or (), save)
+            return
         if save.suffix != ".rrd":  # Rerun opens a recording by its name
             raise IpsysError(
-                f"--save {save}: the name of a Rerun recording ends in .rrd; use {save.stem}.rrd"
+                f"--save {save}: use {save.stem}.rrd for a Rerun recording, or {save.stem}.png for a picture"
             )
         check_file(save, "--save", logs)
+    check_installed("view needs", "rerun")
     from ipsys_log.engine.states import out_of_date_lines
     from ipsys_log.sinks.rerun.recording import write_recording
 
@@ -86,6 +96,19 @@ def view(logs: ReadLogs, run: Runs = None, save: Save = None, foxglove_layout: F
             say(f"{kind:<21} run {named}")
     if save is not None:
         say(f"{save} written; to view it: rerun {save}")
+
+
+def _draw_floor(logs: Sequence[LogLocation], runs: Sequence[str], path: Path) -> None:
+    check_figure_file(path, "--save")
+    from ipsys_log.app.report.accuracy import Accuracy
+    from ipsys_log.app.report.floor_figure import draw_session
+    from ipsys_log.log.dataset import Session
+    from ipsys_log.sinks.selection import choose_runs
+
+    with Session(logs) as session:
+        shown = choose_runs(session, runs).runs
+        draw_session(session, [Accuracy(run, None, None) for run in shown], path)
+    say(f"{path} drawn")
 
 
 def _write_layout(logs: Sequence[LogLocation], runs: Sequence[str], path: Path) -> None:
@@ -155,14 +178,14 @@ report = with_options({**_options, "html": _HTML}, "report", _REPORT)(_report)
 def export(
     logs: ReadLogs,
     output: Annotated[
-        Path,
+        Path | None,
         setting(
             "--output,-o",
             "FILE",
             "The file to write. Its suffix gives the format: .csv, .parquet (tables), .tum, .kitti "
             "(trajectories), .mcap (ROS 2 bag), .mp4 (video). For --format coco: a new folder.",
         ),
-    ],
+    ] = None,
     format_: Annotated[
         str | None,
         setting(
@@ -209,8 +232,11 @@ def export(
         ipsys export monday.mcap -o markers --format coco        # a new folder
     """
     from ipsys_log.api import python_api as api
-    from ipsys_log.api.log_export import find_format, parse_size
+    from ipsys_log.api.log_export import EXPORT_FORMATS, find_format, parse_size
 
+    if output is None:
+        formats = [f"-o NAME{row.suffix} ({row.text})" for row in EXPORT_FORMATS.values() if row.suffix]
+        raise IpsysError(f"-o is missing; use {', '.join(formats)}, or --format coco -o FOLDER")
     wanted = find_format(output, format_)
     if wanted.suffix is not None:
         check_file(output, "-o", logs)

@@ -29,7 +29,10 @@ from ipsys_log.live_runs.survey.lab_calibration import LabCalibration
 from ipsys_log.live_runs.survey.live import LiveScene
 from ipsys_log.messages.rig_file import load_rig
 from ipsys_log.sinks.sink import Sink
-from ipsys_log.statistics.calibration_points import ENOUGH_POINTS, ENOUGH_TEXT
+from ipsys_log.statistics.calibration_points import ENOUGH_DRIVE_POINTS, ENOUGH_POINTS
+
+# The simulated tape measures so many points at once.
+_SHEET_POINTS = ENOUGH_DRIVE_POINTS
 
 
 class Pages(NamedTuple):
@@ -67,7 +70,7 @@ class SetupSession:
             "pictures": ("the pictures of the cameras", "cameras", self._cameras.take_all),
             "align": ("the alignment", "alignment", lambda job: work.align(folder, job)),
             "drive": ("the drive", "drive", lambda job: work.drive(folder, self._show_drive, job)),
-            "sheet": ("the measuring by the sheet", "points", partial(self._measure_sheet, ENOUGH_POINTS)),
+            "sheet": ("the measuring by the sheet", "points", partial(self._measure_sheet, _SHEET_POINTS)),
             "sheet-all": ("the measuring by the sheet", "points", partial(self._measure_sheet, None)),
             "measure": (
                 "the measuring", "points", lambda job: work.measure(folder, pages.measuring, job),
@@ -99,7 +102,7 @@ class SetupSession:
             },
             "points": {
                 "sheet": None if self._folder.sheet is None else self._folder.sheet.name,
-                "enough": ENOUGH_TEXT,
+                "enough": ENOUGH_POINTS,
                 "logs": [[log.path.name, log.points, dict(log.seen)] for log in progress.logs if log.points],
             },
             "map": self._describe_map(progress),
@@ -264,7 +267,7 @@ class SetupSession:
         done_m = [place_m for log in progress.logs for place_m in log.places_m]
         proposed_m: list[tuple[float, float]] = []
         if lab is None:
-            proposed_m = propose_places(rig, done_m, max(2 * ENOUGH_POINTS - len(done_m), 0))
+            proposed_m = propose_places(rig, done_m, max(2 * ENOUGH_DRIVE_POINTS - len(done_m), 0))
         elif not lab.is_enough:
             proposed_m = [(float(point.point_m[0]), float(point.point_m[1])) for point in lab.points]
         return describe_map(rig, done_m, proposed_m)

@@ -16,7 +16,7 @@ from ipsys_log.messages import Rig, RigCamera
 from ipsys_log.messages.rig_file import load_rig
 from ipsys_log.models.table import min_pairs
 from ipsys_log.plain_text import join_names, shell_words
-from ipsys_log.statistics.calibration_points import ENOUGH_POINTS, ENOUGH_TAPE_POINTS, ENOUGH_TEXT
+from ipsys_log.statistics.calibration_points import ENOUGH_DRIVE_POINTS, ENOUGH_POINTS, ENOUGH_TAPE_POINTS
 from ipsys_log.vision.lenses import calibration_remarks
 
 # The model of the tape alone. A drive with two points is the least for the model joint.
@@ -235,9 +235,9 @@ def _points_step(
             missing = str(error)
     text = counted(count, "point") + " measured"
     has_drive = any(log.drive_s for log in logs)
-    if (has_drive and count >= ENOUGH_POINTS) or _is_enough_tape(cameras, logs):
+    if (has_drive and count >= ENOUGH_DRIVE_POINTS) or _is_enough_tape(cameras, logs):
         return StepState("points", title, command, Status.DONE, text)
-    text = missing or f"{text}; enough are {ENOUGH_TEXT}"
+    text = missing or f"{text}; enough are {ENOUGH_POINTS}"
     return StepState("points", title, command, Status.WAITS if missing else Status.READY, text)
 
 

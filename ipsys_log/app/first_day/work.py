@@ -30,7 +30,8 @@ from ipsys_log.capture.live_plan import check_start, shown_run
 from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.capture.simulated import show_board
 from ipsys_log.engine.graph import copy_model
-from ipsys_log.engine.request import Request, wanted_models
+from ipsys_log.engine.model_choice import applied_models
+from ipsys_log.engine.request import Request
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.calibration_files import calibration_text
 from ipsys_log.exchange.lab_files import load_cameras, read_lab
@@ -230,7 +231,7 @@ def track(folder: LabFolder, show: Callable[[LiveRecording], AbstractContextMana
         for line in check_streams(streamed):
             job.say(line)
         with open_live_streams(streamed, opened, run) as streams:
-            model = copy_model(request, wanted_models(request)[0])[1]
+            model = copy_model(request, applied_models(request)[0][0])[1]
             view = LiveRecording(opened, monitor, log, model, run, tuple(streams))
             with show(view) as sink:
                 job.say("open the dashboard")

@@ -27,7 +27,6 @@ _OTHER_HEIGHTS = "other heights"
 # Above this ratio of the largest error to the median, a logarithmic scale makes the small errors visible.
 _LOG_RATIO = 15.0
 _GAP = 0.7  # between models, in rows
-_MOST_ROW_IN = 0.42
 # Horizontal layout of the figure: right end of the axes, their smallest width, and right end of each column.
 _RIGHT_IN = 11.75
 _LEAST_IN = 1.5
@@ -105,7 +104,7 @@ def draw_errors(
     rows = _rows(accuracies)
     heights = _heights(rows)
     _, height = figure.get_size_inches()
-    row_in = min((height - top_in - 0.95) / (heights[-1] + 1.6), _MOST_ROW_IN)
+    row_in = (height - top_in - 1.05) / (heights[-1] + 1.6)
     size = float(np.clip(0.62 * 72 * row_in, 5.5, 9))
     models_in, names_in = _name_widths(rows, size)
     bar_in = left_in + models_in + 0.08

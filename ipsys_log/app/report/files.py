@@ -47,6 +47,28 @@ def check_figure_file(path: Path, option: str) -> None:
         raise IpsysError(f"{option} {path}: is not a figure file; use a name that ends in {ends}")
 
 
+def figure_folder(path: Path) -> tuple[Path, str] | None:
+    """Return the folder of a path for all figures, and their suffix; None if the path is that of one figure.
+
+    Examples
+    --------
+    >>> figure_folder(Path("figures")), figure_folder(Path("figures/*.svg")), figure_folder(Path("a.png"))
+    ((PosixPath('figures'), '.png'), (PosixPath('figures'), '.svg'), None)
+    """
+    if path.stem == "*" and path.suffix.lower() in FIGURE_SUFFIXES:
+        return path.parent, path.suffix.lower()
+    return (path, ".png") if path.is_dir() or not path.suffix else None
+
+
+def check_figures(path: Path, option: str) -> None:
+    """Check a path for one figure or for a folder of all figures, as :func:`check_figure_file` does."""
+    if (folder := figure_folder(path)) is None:
+        check_figure_file(path, option)
+    else:
+        check_installed(f"{option} needs", "matplotlib")
+        check_folder(folder[0], option)
+
+
 def check_folder(folder: Path, option: str) -> None:
     """Check that a folder exists or can be created, and can be written to."""
     existing = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())

@@ -243,7 +243,7 @@ _GAP_NS = 500_000_000
 
 
 def draw_session(session: Session, accuracies: Sequence[Accuracy], path: Path) -> None:
-    """Draw a session into a figure of about 1400 x 800 pixels.
+    """Draw a session into a figure of about 1400 x 800 pixels; without accuracies, the left side alone.
 
     The left side shows the floor to scale: measured points, tracks and, if known, the ground truth. An arrow
     shows the error of the first model at each held-out point. The title states the factor of the arrows. The
@@ -257,7 +257,7 @@ def draw_session(session: Session, accuracies: Sequence[Accuracy], path: Path) -
     scene = read_floor(session, accuracies)
     rows = count_rows(accuracies)
     # Rows of text need some height. With more than about 28 rows, the figure grows.
-    figure = Figure(figsize=(14 if rows else 9, max(8.0, 1.6 + 0.23 * rows)), dpi=_DPI)
+    figure = Figure(figsize=(14 if rows else 7.3, max(8.0, 1.6 + 0.23 * rows)), dpi=_DPI)
     width, height = figure.get_size_inches()
     low_in = height - _TOP_IN - _SIDE_IN
     axes = add_panel(figure, 0.65, low_in, _SIDE_IN, _SIDE_IN)
@@ -265,7 +265,7 @@ def draw_session(session: Session, accuracies: Sequence[Accuracy], path: Path) -
     draw_floor(axes, scene, styles)
     handles, labels = axes.get_legend_handles_labels()
     figure.legend(
-        handles, labels, loc="upper left", ncols=5, fontsize=8, frameon=False,
+        handles, labels, loc="upper left", ncols=6, fontsize=8, frameon=False,
         bbox_to_anchor=(0.4 / width, (low_in - 0.5) / height),
     )  # fmt: skip
     if rows:

@@ -170,7 +170,7 @@ def _commands(session: Session, findings: Findings) -> dict[str, str]:
     return {
         "report": f"ipsys report {logs}",
         "errors": f"ipsys evaluate {logs}{models} --details",
-        "plots": f"ipsys evaluate {logs}{models} --plots figures",
+        "plots": f"ipsys evaluate {logs}{models} --plot figures",
         "tracks": f"ipsys view {logs}",
         "info": f"ipsys info {logs}",
         "check": f"ipsys check {logs} --details",

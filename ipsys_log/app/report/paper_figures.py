@@ -18,7 +18,7 @@ from matplotlib.quiver import Quiver
 from ipsys_log.app.report import calibration_figures
 from ipsys_log.app.report.accuracy import Accuracy
 from ipsys_log.app.report.advice import has_published, label
-from ipsys_log.app.report.figures import ERROR_COLOURS, png, scale_logarithmic, style_axes
+from ipsys_log.app.report.figures import ERROR_COLOURS, figure_bytes, scale_logarithmic, style_axes
 from ipsys_log.app.report.files import write_files
 from ipsys_log.app.report.findings import Findings, errors_in, overall_row
 from ipsys_log.app.report.floor_figure import (
@@ -249,43 +249,50 @@ def _csv(header: Sequence[str], rows: Iterable[Sequence[str]]) -> bytes:
     return text.getvalue().encode()
 
 
-# For each file: the condition to write it, and the function that returns its bytes.
-_FILES: dict[str, tuple[Callable[[Findings], bool], Callable[[Findings], bytes]]] = {
-    "table_1.csv": (lambda f: bool(f.accuracies), lambda f: paper_csv(f, in_space=True)),
-    "table_2.csv": (lambda f: bool(f.accuracies), lambda f: paper_csv(f, in_space=False)),
-    "cross_validation.csv": (lambda f: any(a.rows(True) for a in f.accuracies), cross_validation_csv),
-    "figure_9.png": (lambda f: bool(f.training_m() or f.test_m()), lambda f: png(places_figure(f))),
-    "figure_10.png": (
+# For each table: the condition to write it, and the function that returns its bytes.
+_TABLES: dict[str, tuple[Callable[[Findings], bool], Callable[[Findings], bytes]]] = {
+    "table_1": (lambda f: bool(f.accuracies), lambda f: paper_csv(f, in_space=True)),
+    "table_2": (lambda f: bool(f.accuracies), lambda f: paper_csv(f, in_space=False)),
+    "cross_validation": (lambda f: any(a.rows(True) for a in f.accuracies), cross_validation_csv),
+}
+# The same for each figure.
+_DRAWN: dict[str, tuple[Callable[[Findings], bool], Callable[[Findings], Figure]]] = {
+    "figure_9": (lambda f: bool(f.training_m() or f.test_m()), places_figure),
+    "figure_10": (
         lambda f: has_published(f.evaluations) and f.in_space,
-        lambda f: png(published_figure(f, in_space=True)),
+        lambda f: published_figure(f, in_space=True),
     ),
-    "figure_11.png": (lambda f: has_published(f.evaluations), lambda f: png(published_figure(f, False))),
-    "learning_curve.png": (lambda f: bool(mean_curves(f, False)), lambda f: png(learning_figure(f))),
-    "errors_floor.png": (lambda f: bool(shown_models(f)), lambda f: png(residuals_figure(f))),
-    "models.png": (lambda f: bool(f.accuracies), lambda f: png(models_figure(f))),
-    "camera_poses.png": (
+    "figure_11": (lambda f: has_published(f.evaluations), lambda f: published_figure(f, False)),
+    "learning_curve": (lambda f: bool(mean_curves(f, False)), learning_figure),
+    "errors_floor": (lambda f: bool(shown_models(f)), residuals_figure),
+    "models": (lambda f: bool(f.accuracies), models_figure),
+    "camera_poses": (
         lambda f: bool(f.calibrated),
-        lambda f: png(calibration_figures.poses_figure(f.calibrated, f.rig)),
+        lambda f: calibration_figures.poses_figure(f.calibrated, f.rig),
     ),
-    "clock_offsets.png": (
+    "clock_offsets": (
         lambda f: calibration_figures.has_clocks(f.calibrated),
-        lambda f: png(calibration_figures.clocks_figure(f.calibrated)),
+        lambda f: calibration_figures.clocks_figure(f.calibrated),
     ),
 }
 
 
-def _image_residuals(findings: Findings) -> dict[str, bytes]:
+def _image_residuals(findings: Findings) -> dict[str, Figure]:
     """Return a map of the corner residuals in the image of each camera of the joint model."""
     most_px = calibration_figures.residual_limit_px(findings.calibrated)
     return {
-        f"image_residuals_{camera.camera}.png": png(calibration_figures.residuals_figure(camera, most_px))
+        f"image_residuals_{camera.camera}": calibration_figures.residuals_figure(camera, most_px)
         for camera in findings.calibrated
         if camera.residuals is not None
     }
 
 
-def write_plots(findings: Findings, folder: Path) -> list[str]:
+def write_plots(findings: Findings, folder: Path, suffix: str = ".png") -> list[str]:
     """Write all tables and figures that have data into a folder: all files, or none.
+
+    Parameters
+    ----------
+    suffix : of the figures, which gives their format.
 
     Returns
     -------
@@ -296,8 +303,13 @@ def write_plots(findings: Findings, folder: Path) -> list[str]:
     IpsysError
         No model was evaluated.
     """
-    files = {name: draw(findings) for name, (has_data, draw) in _FILES.items() if has_data(findings)}
-    files.update(_image_residuals(findings))
+    files = {
+        f"{name}.csv": make(findings) for name, (has_data, make) in _TABLES.items() if has_data(findings)
+    }
+    figures = {name: draw(findings) for name, (has_data, draw) in _DRAWN.items() if has_data(findings)}
+    figures |= _image_residuals(findings)
+    named = {f"{name}{suffix}": figure for name, figure in figures.items()}
+    files |= {name: figure_bytes(figure, Path(name)) for name, figure in named.items()}
     if not files:
         raise IpsysError(
             f"{folder}: nothing to draw: no model was evaluated, because no calibration point is held out; "

@@ -93,8 +93,8 @@ class _Parts:
         return TRACKS.topic_of(shown_run(self.request))
 
     def check_start(self) -> None:
-        names = self.run.lab.cameras
-        for line in check_start(self.rig, names, names, self.request, None):
+        lenses = _lenses(self.lab(0))
+        for line in check_start(self.rig, [*lenses], lenses, self.request, None):
             self.say(line)
 
     def lab(self, start_ns: int) -> RobotLab:

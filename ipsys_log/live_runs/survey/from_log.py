@@ -290,8 +290,6 @@ def place_in_log(measurement: Measurement, earlier: Sequence[Message]) -> Messag
 
 
 def _append(path: Path, names: Sequence[str], reason: str, readmits: bool) -> ExclusionResult:
-    if not reason.strip():
-        raise IpsysError('--reason: is empty; say why, such as --reason "the tape sagged"')
     with LogWriter.append(path) as writer:  # no other process adds measurements from here on
         with Session([path]) as session:
             messages = list(session.messages(session.topics(MEASUREMENTS)))
@@ -299,6 +297,8 @@ def _append(path: Path, names: Sequence[str], reason: str, readmits: bool) -> Ex
         points = {measurement.id: measurement for measurement in history if measurement.is_point}
         excluded = withdrawals(history)
         chosen = _chosen_ids(path, points, names)
+        if not reason.strip():
+            raise IpsysError('--reason: is missing; say why, such as --reason "the tape sagged"')
         changed = [name for name in chosen if (name in excluded) == readmits]
         for name in changed:
             payload = (

@@ -345,7 +345,11 @@ def _numbers(times_ns: NDArray[np.int64], tracks: Sequence[Track]) -> NDArray[np
     """Return the number (n,) of the track of each row: a track began after the row before its first row."""
     numbers = np.zeros(len(tracks), dtype=np.int64)
     for row in range(1, len(tracks)):
-        age_ns, gap_ns = tracks[row].age_ns, int(times_ns[row] - times_ns[row - 1])
-        begins = gap_ns > _LONGEST_GAP_NS if age_ns is None else age_ns < gap_ns
-        numbers[row] = numbers[row - 1] + begins
+        gap_ns = int(times_ns[row] - times_ns[row - 1])
+        numbers[row] = numbers[row - 1] + begins_track(gap_ns, tracks[row].age_ns)
     return numbers
+
+
+def begins_track(gap_ns: int, age_ns: int | None) -> bool:
+    """Return whether a track begins at a row, by the time since the last row of its robot and its age."""
+    return gap_ns > (_LONGEST_GAP_NS if age_ns is None else age_ns)

@@ -202,6 +202,12 @@ class ScoreResult:
     own: tuple[Score, ...]
     other_versions: tuple[str, ...] = ()
 
+    def __repr__(self) -> str:
+        return (
+            f"<ScoreResult of {self.title}: {len(self.comparisons)} of {len(self.stated)} scores computed, "
+            f"as_stated={self.as_stated}; {len(self.own)} scores of your models>"
+        )
+
     @property
     def as_stated(self) -> bool | None:
         """Return whether all repeated scores come out as stated; None if none was repeated."""

@@ -21,6 +21,7 @@ from ipsys_log.messages.events import (
     CAMERA_MOVED,
     CONTRADICTED_HEIGHT,
     FRAME_SKIPPED,
+    MODEL_CONTRADICTED,
     NODE_ANSWERS,
     NODE_AWAITED,
     OPERATOR_KINDS,
@@ -47,6 +48,7 @@ _ADVICE = {
     TILTED_MARKER: "run ipsys replay --method pose",
     CALIBRATION_CONTRADICTED: "correct lab.toml, or give the file with --calibration CAMERA=calibration.yaml",
     CAMERA_MOVED: "calibrate the camera again, or run ipsys drift",
+    MODEL_CONTRADICTED: "apply a model of this lab: ipsys replay LOG --model-from calibration.mcap",
     "frames_dropped": "record on a faster disk",
     "frames_missed": "reduce the rate or the size of the images, or use another USB bus",
 }

@@ -42,6 +42,10 @@ class LogCheck:
     path: LogLocation
     findings: tuple[LogFinding, ...] = ()
 
+    def __repr__(self) -> str:
+        notes = len(self.findings) - len(self.remarks)
+        return f"<LogCheck of {self.path}: {self.state}; {len(self.remarks)} remarks, {notes} notes>"
+
     @property
     def state(self) -> str:
         """Return ``sound``, ``readable`` (with remarks), ``unread`` or ``broken``."""

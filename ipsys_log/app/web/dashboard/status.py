@@ -37,7 +37,7 @@ _WARNINGS = frozenset(
     (
         *(CAMERA_MOVED, FRAME_SKIPPED, STAMP_UNRELIABLE, "ambiguous_marker", "camera_size"),
         *("corrupt_frame", "frames_missed", "mirrored_camera", "no_keyframe", "no_keyframes"),
-        *("other_prints", "sink_dropped", "wrong_size"),
+        *("model_contradicted", "other_prints", "sink_dropped", "wrong_size"),
     )
 )
 

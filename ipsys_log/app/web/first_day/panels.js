@@ -285,7 +285,7 @@ function points(state, act, step) {
   const { sheet, logs, enough } = state.points;
   const now = state.measured_now, isFirst = step.status !== "done";
   const parts = [
-    paragraph(`Put a marker that no robot carries on the floor, near a numbered place of the map. Measure its distances from A and B with a tape, and type them on the measuring page. Enough are ${enough}; eight points after a drive are better.`),
+    paragraph(`Put a marker that no robot carries on the floor, near a number on the map. Measure its distances from A and B with a tape, and type them on the measuring page. Enough are ${enough}; eight points after a drive are better.`),
   ];
   const actions = make("div", { className: "actions" });
   if (state.pages.measure) actions.append(opener("open-measure", "measure", "Open the measuring page"), finish("Finish measuring", state, act));

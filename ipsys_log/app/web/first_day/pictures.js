@@ -86,5 +86,5 @@ export function floorMap({ floor: [width, depth], references, done, proposed }, 
   for (const [x, y] of done) svg.append(element("circle", { cx: x, cy: depth - y, r: unit / 2.5, class: "done" }));
   proposed.forEach(({ point_m: [x, y] }, n) => svg.append(element("circle", { cx: x, cy: depth - y, r: unit / 2, class: "proposed" }), text(x, y, String(n + 1))));
   const rows = proposed.map(({ tapes }) => make("li", { textContent: Object.entries(tapes).map(([name, cm]) => `${name} ${cm} cm`).join(", ") }));
-  return make("div", { className: "map" }, svg, ...(rows.length ? [make("div", {}, make("p", { textContent: "Places to measure, by about these distances:" }), make("ol", {}, ...rows))] : []));
+  return make("div", { className: "map" }, svg, ...(rows.length ? [make("div", {}, make("p", { textContent: "Points to measure, at about these distances:" }), make("ol", {}, ...rows))] : []));
 }

@@ -209,7 +209,7 @@ const choose = guarded(async (id) => {
 
 function offerMarkers() {
   const [only, ...others] = view.visible;
-  $("marker").placeholder = only !== undefined && !others.length ? `${only}, the only visible marker` : "tap it in an image, or type its id";
+  $("marker").placeholder = only !== undefined && !others.length ? `${only}, the only visible marker` : "tap it, or type its id";
 }
 
 // --- calibration points -----------------------------------------------------------------------

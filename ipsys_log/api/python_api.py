@@ -504,7 +504,7 @@ def live(
         for line in check_streams(streamed):
             say(line)
         with open_lab(lab, say) as opened, open_live_streams(streamed, opened, shown_run(request)) as streams:
-            tracker.begin(opened.cameras.stop)
+            tracker.begin(opened.cameras.stop, opened.cameras.positions)
             sinks: list[Sink] = [tracker, *streams]
             return pipeline.live(
                 opened.cameras, opened.settings, target, request, sinks=sinks, overwrite=force

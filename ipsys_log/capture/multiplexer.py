@@ -19,6 +19,7 @@ from ipsys_log.capture.frames import Clock, Heartbeat, Open, Say, SourceError
 from ipsys_log.capture.nodes.centre import is_of_node
 from ipsys_log.capture.nodes.receiver import passing_period_s
 from ipsys_log.messages import EVENTS_TOPIC, CompressedImage, CompressedVideo, Event, Message, RigCamera
+from ipsys_log.statistics.latency import PositionMonitor
 from ipsys_log.units import NS_PER_S
 
 # Most bytes of frames that wait to be written: some seconds of three cameras.
@@ -52,6 +53,7 @@ class LiveCameras:
     ----------
     states : states of the cameras, by camera name.
     received_ns : arrival times of the last frames, by log time.
+    positions : the state of the positions, if stages compute some.
 
     Raises
     ------
@@ -86,6 +88,7 @@ class LiveCameras:
         self.states = {
             camera.name: reader.state for camera, reader in zip(cameras, self._readers, strict=True)
         }
+        self.positions = PositionMonitor(clock.now_ns, self.states, say)
 
     def __enter__(self) -> LiveCameras:
         try:

@@ -22,6 +22,7 @@ from ipsys_log.log.journal import DISK, open_locked, roll_back
 from ipsys_log.log.writer import LogWriter
 from ipsys_log.messages import STAMP_UNRELIABLE, CompressedImage, CompressedVideo, Event, Measurement, Message
 from ipsys_log.plain_text import shell_words
+from ipsys_log.statistics.latency import PositionMonitor
 
 # After an interrupt, the recorder waits no longer than this for a write.
 _SETTLE_S = 1.0
@@ -48,7 +49,10 @@ class Source(Protocol):
 
 
 class CameraSource(Source, Protocol):
-    """The cameras of a live run: their states, their clock, and the arrival times of frames by log time."""
+    """The cameras of a live run.
+
+    It has their states, their clock, the arrival times of frames by log time, and the state of positions.
+    """
 
     @property
     def states(self) -> Mapping[str, CameraState]: ...
@@ -58,6 +62,9 @@ class CameraSource(Source, Protocol):
 
     @property
     def received_ns(self) -> Mapping[int, int]: ...
+
+    @property
+    def positions(self) -> PositionMonitor: ...
 
     @property
     def say(self) -> Say: ...

@@ -228,7 +228,7 @@ def live(
     first = (*settings, *plan.copies(cameras.now_ns))
     knocks = knock_events(plan.rig, cameras.add_event)
     with (
-        FanOut([knocks, _contradictions(cameras.say), *sinks], cameras.add_event) as show,
+        FanOut([cameras.positions, knocks, _contradictions(cameras.say), *sinks], cameras.add_event) as show,
         one_blas_thread(),
         open_recording(target, first, overwrite) as log,
         ExitStack() as resources,

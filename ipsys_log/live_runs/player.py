@@ -35,6 +35,7 @@ from ipsys_log.sinks.sink import FanOut, Sink
 from ipsys_log.sinks.streams import StreamSettings
 from ipsys_log.sinks.streams.opening import Stream, open_streams
 from ipsys_log.sinks.streams.poses import StreamContext
+from ipsys_log.statistics.latency import PositionMonitor, PositionState
 
 if TYPE_CHECKING:
     from ipsys_log.sinks.rerun.viewer import ViewerPage
@@ -74,6 +75,7 @@ class Tracker:
         self.dropped = 0
         self.outcomes: tuple[Outcome, ...] = ()
         self._stop_cameras: Callable[[], None] | None = None
+        self._positions: PositionMonitor | None = None
         self._newest: queue.SimpleQueue[LiveTracks | None] = queue.SimpleQueue()
         self._fault: BaseException | None = None
         self._begun = threading.Event()
@@ -100,15 +102,20 @@ class Tracker:
                 tracks = newer
             yield tracks
 
+    @property
+    def state(self) -> PositionState | None:
+        """The state of the positions now: live, late or stale; None before the first processed frame."""
+        return None if self._positions is None else self._positions.state
+
     def stop(self) -> None:
         """Take no more frames; the iteration ends after the last tracks."""
         self._stopped = True
         if self._stop_cameras is not None:
             self._stop_cameras()
 
-    def begin(self, stop_cameras: Callable[[], None]) -> None:
+    def begin(self, stop_cameras: Callable[[], None], positions: PositionMonitor | None = None) -> None:
         """Note that the cameras send; the pipeline calls this method."""
-        self._stop_cameras = stop_cameras
+        self._stop_cameras, self._positions = stop_cameras, positions
         if self._stopped:
             stop_cameras()
         self._begun.set()

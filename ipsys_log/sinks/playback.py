@@ -102,7 +102,7 @@ class Playback:
         self._changed = threading.Condition()
         self._timeline = _Timeline(self._start_ns, now_ns, self._options.rate, self._options.start_paused)
         self._target_ns: int | None = self._start_ns
-        self._steps = 0
+        self._steps = self._lead_ns = 0
         # The capture time of the last message: during a pause, others of the same time follow it.
         self._played_ns: int | None = None
         self._stopped = False
@@ -149,9 +149,13 @@ class Playback:
             self._steps += 1
             self._changed.notify_all()
 
-    def seek(self, position_s: float) -> None:
-        """Continue at a time since the first message, in s; a time outside the log is moved to its end."""
+    def seek(self, position_s: float, lead_s: float = 0.0) -> None:
+        """Continue at a time since the first message, in s; a time outside the log is moved to its end.
+
+        In a pause, the messages of the last ``lead_s`` before it are played at once.
+        """
         with self._changed:
+            self._lead_ns = round(lead_s * NS_PER_S) if self.is_paused else 0
             time_ns = self._first_ns + round(position_s * NS_PER_S)
             self._target_ns = min(max(time_ns, self._first_ns), self._last_ns)
             self._timeline.jump(self._target_ns, self._clock.now_ns())
@@ -169,9 +173,11 @@ class Playback:
         """Yield the messages, each at its time."""
         while (start_ns := self._begin()) is not None:
             yield Message("", start_ns, start_ns, NewSession(self.session))
-            for message in in_capture_order(self._read(start_ns)):
-                if message.publish_time_ns >= start_ns:
-                    if not self._wait_until(message.publish_time_ns):
+            begin_ns = start_ns - self._lead_ns
+            for message in in_capture_order(self._read(begin_ns)):
+                if message.publish_time_ns >= begin_ns:
+                    is_before = message.publish_time_ns < start_ns
+                    if not self._wait_until(message.publish_time_ns, is_before):
                         break
                     yield self._stamped(message)
             else:
@@ -191,10 +197,10 @@ class Playback:
     def _rewind(self) -> None:
         with self._changed:
             if self._target_ns is None and self.loop:
-                self._target_ns = self._first_ns
+                self._target_ns, self._lead_ns = self._first_ns, 0
 
-    def _wait_until(self, time_ns: int) -> bool:
-        """Wait for the time of a message; return False if another one comes next."""
+    def _wait_until(self, time_ns: int, is_before: bool) -> bool:
+        """Wait for the time of a message, unless it is of the lead; return False if another one is next."""
         with self._changed:
             while not self._stopped and self._target_ns is None:
                 now_ns = self._clock.now_ns()
@@ -203,7 +209,7 @@ class Playback:
                     self._steps -= 1
                     self._timeline.jump(time_ns, now_ns)
                     self._played_ns = time_ns
-                if delay_s == 0 or time_ns == self._played_ns:
+                if is_before or delay_s == 0 or time_ns == self._played_ns:
                     self._played_ns = time_ns
                     return True
                 self._wait(self._changed, min(delay_s, _TURN_S))

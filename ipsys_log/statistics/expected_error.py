@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 from ipsys_log.calibration.joint.locate import locate_markers
 from ipsys_log.calibration.joint.model import JointModel
 from ipsys_log.messages import Array, Mask
+from ipsys_log.messages.stage import Progress
 from ipsys_log.statistics.floor_cameras import FloorGrid
 from ipsys_log.statistics.plan import mean_length
 from ipsys_log.statistics.tape import TapeCovariances
@@ -244,6 +245,7 @@ def choose_points(
     goal_m: float,
     count: int,
     heights_m: Array | float = 0.0,
+    progress: Progress = lambda done, total: None,
 ) -> list[TapedPoint]:
     """Choose the points on the floor whose tape readings reduce the mean expected error most, one by one.
 
@@ -260,6 +262,7 @@ def choose_points(
     goal_m : wanted mean error.
     count : the largest number of points.
     heights_m : heights of the candidates above the floor, a number or (c,).
+    progress : called after each point.
 
     References
     ----------
@@ -274,6 +277,7 @@ def choose_points(
     update = np.eye(modes_m.shape[2])
     mean_m = mean_error(modes_m)
     while len(chosen) < count and mean_m > goal_m:
+        progress(len(chosen), count)
         best = candidates.choose(modes_m @ update, update)
         if best is None:
             break

@@ -17,6 +17,7 @@ from ipsys_log.calibration.joint.model import JointModel
 from ipsys_log.calibration.joint.settings import JointSettings
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Array
+from ipsys_log.messages.stage import Progress
 from ipsys_log.statistics.expected_error import (
     ExpectedErrors,
     choose_points,
@@ -75,6 +76,7 @@ def plan_joint_points(
     tape_m2: TapeCovariances,
     length_m: float,
     count: int,
+    progress: Progress = lambda done, total: None,
 ) -> MeasurementPlan:
     """Choose the points to measure next, and predict the error over the floor after each.
 
@@ -86,6 +88,7 @@ def plan_joint_points(
     tape_m2 : function for the covariances of tape readings.
     length_m : side of the marker.
     count : number of points.
+    progress : called after each point.
 
     Raises
     ------
@@ -93,7 +96,9 @@ def plan_joint_points(
         No camera sees a candidate.
     """
     flat_m, heights_m = candidates_m[:, :2], candidates_m[:, 2]
-    points = choose_points(models, sizes_px, expected, flat_m, tape_m2, length_m, 0.0, count, heights_m)
+    points = choose_points(
+        models, sizes_px, expected, flat_m, tape_m2, length_m, 0.0, count, heights_m, progress
+    )
     if not points:
         raise IpsysError("no camera sees a whole marker at these heights on the floor; give another height")
     updates = [None, *(point.update for point in points)]

@@ -14,6 +14,7 @@ from scipy.spatial import ConvexHull, cKDTree
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Array, CameraCalibration, Mask
+from ipsys_log.messages.stage import Progress
 from ipsys_log.models.rays import directions
 from ipsys_log.models.uncertainty import Predict, Uncertainty, leverage_terms
 from ipsys_log.vision.lenses import in_image
@@ -127,6 +128,7 @@ def plan_points(
     tape_m2: Tape,
     radius_m: float,
     count: int,
+    progress: Progress = lambda done, total: None,
 ) -> MeasurementPlan:
     """Choose the calibration points to measure next.
 
@@ -140,6 +142,7 @@ def plan_points(
     tape_m2 : function for the variance of a tape measurement.
     radius_m : radius of the disc about a marker that a camera must see.
     count : number of calibration points to choose.
+    progress : called after each point.
 
     Raises
     ------
@@ -180,7 +183,8 @@ def plan_points(
     used = np.bincount(np.abs(fitted_m[:, 2:] - levels).argmin(axis=1), minlength=len(levels))
     before_m = after_m = _least(shares, len(floor_m))
     places = []
-    for _ in range(count):
+    for number in range(count):
+        progress(number, count)
         allowed, mean_m = near & (used[level] == used.min()), float(np.nanmean(after_m))
         best = _choose(_means_with_each(shares, after_m, allowed), mean_m, apart_m)
         used[level[best]] += 1

@@ -9,18 +9,21 @@ from collections import namedtuple
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from ipsys_log.app.cli import open_cameras as open_cameras_module
 from ipsys_log.app.cli.open_cameras import open_cameras, prepare_lab
 from ipsys_log.app.report.cameras import LiveStatus
 from ipsys_log.capture.disk import DiskRoom, expected_bytes_per_s, free_room
 from ipsys_log.capture.frames import CameraState
 from ipsys_log.capture.live_check import CameraMonitor
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import CompressedImage, Message, Rig, RigCamera
+from ipsys_log.messages import CompressedImage, Message, Rig, RigCamera, image_topic
 from ipsys_log.units import NS_PER_S
 from tests.conftest import Ipsys, small_disk
+from tests.sinks.streaming import judged
 
 RIG = Rig("lab", "DICT_4X4_100", 0.2)
 Usage = namedtuple("Usage", "total used free")
@@ -143,6 +146,64 @@ def test_recording_is_reported_when_the_first_frame_is_on_the_disk(tmp_path: Pat
         status(Message("/cameras/red/image", 12 * NS_PER_S, 12 * NS_PER_S, image, "red"))
         now_s[0] = 900.9
         assert status.summary()[0] == f"{log} written: 2.0 s, 7.1 kB"
+
+
+def image(camera: str, time_s: float) -> Message:
+    time_ns = round(time_s * NS_PER_S)
+    return Message(
+        image_topic(camera), time_ns, time_ns, CompressedImage(time_ns, camera, b"", "jpeg"), camera
+    )
+
+
+def test_camera_that_delivers_fewer_frames_is_named(tmp_path: Path) -> None:
+    sources = {"red": "usb:0", "white": "sim:white", "black": "usb:2", "gate": "file:gate.mp4"}
+    cameras = [RigCamera(name, source=source, rate_hz=10.0) for name, source in sources.items()]
+    frames = {"red": 19, "white": 14, "black": 50, "gate": 3}
+    states = {name: CameraState(frames=count) for name, count in frames.items()}
+    with CameraMonitor(RIG) as monitor:
+        status = LiveStatus(states, monitor, tmp_path / "a.mcap", lambda: 0.0, cameras=cameras)
+        status(Message("/rig", 0, 0, RIG))  # before the cameras were open
+        for time_s in (10.0, 15.2):
+            status(image("red", time_s))
+        assert [line for line in status.summary() if " delivers " in line] == [
+            "camera red delivers 3.7 of 10 frames/s: check its exposure_s, its cable and the load of this "
+            "computer, or lower rate_hz in the rig",
+            "camera white delivers 2.7 of 10 frames/s: this computer draws its images too slowly; lower "
+            "rate_hz in the rig",
+        ]
+
+
+def test_display_shows_late_positions_with_their_cause(tmp_path: Path) -> None:
+    with CameraMonitor(RIG) as monitor:
+        status = LiveStatus({}, monitor, tmp_path / "a.mcap", lambda: 0.0, positions=judged("late"))
+        shown = [str(part) for part in status.show().renderables]
+        assert "positions are late: 0.4 s. The cause. The remedy" in shown
+
+
+def test_seconds_count_from_the_first_processed_frame(
+    lab: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    timers: list[list[Any]] = []
+
+    class Timer:
+        def __init__(self, seconds: float, _: object) -> None:
+            self.row = [seconds, "made"]
+            timers.append(self.row)
+
+        def start(self) -> None:
+            self.row[1] = "runs"
+
+        def cancel(self) -> None:
+            self.row[1] = "cancelled"
+
+    monkeypatch.setattr(open_cameras_module, "Timer", Timer)
+    with opening(rig_that_plays(lab), tmp_path / "a.mcap", 10.0) as status:
+        status(Message("/rig", 0, 0, RIG))
+        assert timers == [[70.0, "runs"]]  # the command also ends without any frame
+        status(image("red", 1.0))
+        status(image("red", 2.0))
+        assert timers == [[70.0, "cancelled"], [10.0, "runs"]]
+    assert timers[1][1] == "cancelled"
 
 
 def test_expected_rate_is_that_of_the_rig_and_the_first_frames() -> None:

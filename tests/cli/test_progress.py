@@ -32,6 +32,26 @@ def test_long_step_prints_tenths_and_short_one_its_end(capsys: pytest.CaptureFix
     assert capsys.readouterr().err.splitlines() == [*tenths, *ends]
 
 
+def test_long_work_says_its_duration_once(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_s = 0.0
+    monkeypatch.setattr(console, "monotonic", lambda: now_s)
+    steps: list[tuple[float, str, int, int]] = [
+        *((2.0, "fits", done, 3) for done in range(4)),
+        (0.0, "models", 0, 3),  # 8 times the 6 s of the fits, in two processes
+        (9.0, "models", 1, 3),
+        *((0.16, "detect", done, 100) for done in range(20)),
+        *((0.1, "cut", done, 100) for done in range(20)),
+        *((5.0, "evaluate poly", done, 10) for done in range(3)),  # a part of models
+    ]
+    with progress_bar((), jobs=2) as show:
+        for took_s, stage, done, total in steps:
+            now_s += took_s if done else 0.0
+            show(stage, done, total)
+    assert capsys.readouterr().err.splitlines() == ["models: about 24 s left", "detect: about 14 s left"]
+
+
 def test_each_bar_shows_its_own_progress(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -331,7 +331,9 @@ def test_live_loop_of_python_opens_the_streams_of_its_rig(
     lines: list[str] = []
     with ipsys_log.live(rig, record=log, model_from=calibration, say=lines.append) as tracker:
         assert next(iter(tracker)).tracks
-        assert json.loads(listening.recv(4096))["robot"].startswith("marker_")
+        pose = json.loads(listening.recv(4096))
+        assert (pose["robot"].startswith("marker_"), "late" in pose) == (True, True)
+        assert tracker.state is not None
     assert f"UDP 127.0.0.1:{port_of(listening)}: only this machine" in lines
 
 

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import pty
 import re
+import subprocess
+import sys
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +22,7 @@ from ipsys_log.live_runs.pipeline import replay
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import MEASUREMENTS_TOPIC, Measurement, Message, ReferencePoint, Suspect
 from tests import labs
-from tests.conftest import Ipsys
+from tests.conftest import ROOT, Ipsys
 from tests.report.browser import visit
 from tests.report.conftest import lab_messages, many_models
 from tests.web.contrast import low_contrasts
@@ -149,6 +154,31 @@ def test_report_evaluates_changed_points_with_the_models_of_the_log(ipsys: Ipsys
     with Session([log]) as session:
         assert [run.run for run in session.runs() if run.stage == "evaluate"] == ["poly", "poly_2"]
     assert "evaluated before: poly;" in ipsys("report", log).err
+
+
+def test_report_asks_on_a_terminal_before_it_evaluates(tmp_path: Path) -> None:
+    log = tmp_path / "lab.mcap"
+    write_log(log, lab_messages())
+    before = log.read_bytes()
+    ours, theirs = pty.openpty()
+    os.write(ours, b"n\n")
+    command = [sys.executable, "-m", "ipsys_log", "report", str(log)]
+    environment = os.environ | {"TERM": "xterm", "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        command, stdin=theirs, stdout=theirs, stderr=theirs, env=environment, check=False, timeout=240
+    )
+    os.close(theirs)
+    shown = b""
+    with suppress(OSError):  # the end of the terminal
+        while part := os.read(ours, 1 << 16):
+            shown += part
+    os.close(ours)
+    text = " ".join(shown.decode().split())
+    assert done.returncode == 0, text
+    assert "no model is evaluated yet. Evaluate all models now?" in text
+    assert "no page was written" in text
+    assert log.read_bytes() == before
+    assert [*tmp_path.iterdir()] == [log]
 
 
 def test_report_into_a_new_log_stands_beside_that_one(ipsys: Ipsys, tmp_path: Path) -> None:

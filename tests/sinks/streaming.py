@@ -6,6 +6,8 @@ import threading
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
@@ -13,6 +15,7 @@ from ipsys_log.capture.frames import Clock
 from ipsys_log.engine.output import write_log
 from ipsys_log.messages import Message, Rig, RigMarker, Track, Tracks
 from ipsys_log.sinks.sink import InlineSink
+from ipsys_log.statistics.latency import PositionState
 from ipsys_log.units import NS_PER_S
 
 START_NS = 1_700_000_000 * NS_PER_S
@@ -36,6 +39,11 @@ def moving_track(robot: str, heading_rad: float) -> Track:
         turn_rate_rad_s=0.1,
         turn_rate_sigma_rad_s=0.03,
     )
+
+
+def judged(state: str) -> Any:
+    """A monitor whose positions have this state, of 0.4 s."""
+    return SimpleNamespace(state=PositionState(state, 0.4, "The cause", "The remedy"))
 
 
 def tracks(number: int, *rows: Track, late_ns: int = 30_000_000) -> Message:

@@ -32,9 +32,10 @@ from ipsys_log.sinks.streams import foxglove as foxglove_stream
 from ipsys_log.sinks.streams.foxglove import FoxgloveStream
 from ipsys_log.sinks.streams.foxglove_messages import SUBPROTOCOLS, Subscriptions
 from ipsys_log.sinks.streams.poses import NewSession
+from ipsys_log.statistics.latency import PositionState
 from tests.node_packages import install
 from tests.sinks.open_sockets import exposed, open_sockets
-from tests.sinks.streaming import RIG, START_NS, STEP_NS, TOPIC, send_all, tracks
+from tests.sinks.streaming import RIG, START_NS, STEP_NS, TOPIC, judged, send_all, tracks
 from tests.waiting import wait_until
 
 SECRET = "the-secret"
@@ -169,6 +170,24 @@ def test_later_client_gets_the_rig_and_images_only_if_asked() -> None:
             )
     with streaming(with_images=True) as (stream, _):
         assert isinstance(image.payload, stream.payloads)
+
+
+def test_status_is_shown_while_positions_are_late(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(foxglove_stream, "_STATUS_S", 0.01)
+    positions = judged("late")
+    with streaming(positions=positions) as (stream, _), opened(stream) as client:
+        wait_until(lambda: stream._status, "the server knows the state")
+        with opened(stream) as later:
+            subscribed(later)
+            shown = json.loads(later.recv(_LIMIT_S))
+        assert (shown["op"], shown["level"]) == ("status", 1)
+        assert shown["message"] == "positions are late: 0.4 s. The cause. The remedy"
+        positions.state = PositionState("live", 0.1)
+        subscribed(client)
+        last = json.loads(client.recv(_LIMIT_S))
+        while last["op"] == "status":
+            last = json.loads(client.recv(_LIMIT_S))
+        assert last == {"op": "removeStatus", "statusIds": [shown["id"]]}
 
 
 def test_session_of_a_replay_begins_at_its_time() -> None:

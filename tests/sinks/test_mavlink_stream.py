@@ -20,7 +20,7 @@ from ipsys_log.messages import Message
 from ipsys_log.sinks.streams.mavlink import MavlinkStream, parse_endpoint
 from ipsys_log.sinks.streams.poses import NewSession, PoseSource
 from tests.sinks.autopilots import ardupilot, px4
-from tests.sinks.streaming import START_NS, STEP_NS, TOPIC, moving_track, send_all, track, tracks
+from tests.sinks.streaming import START_NS, STEP_NS, TOPIC, judged, moving_track, send_all, track, tracks
 
 _LIMIT_S = 240.0
 NOW_NS = START_NS + 7
@@ -60,10 +60,10 @@ def autopilot(monkeypatch: pytest.MonkeyPatch) -> Iterator[Autopilot]:
 
 @contextmanager
 def streaming(
-    autopilot: Autopilot, message: str = "", north_rad: float = pi / 2
+    autopilot: Autopilot, message: str = "", north_rad: float = pi / 2, positions: Any = None
 ) -> Iterator[tuple[MavlinkStream, list[str]]]:
     events: list[str] = []
-    poses = PoseSource({TOPIC}, lambda: START_NS, 300, ["ada"])
+    poses = PoseSource({TOPIC}, lambda: START_NS, 300, ["ada"], positions=positions)
     endpoint = parse_endpoint(f"ada={autopilot.target}{message}")
     stream = MavlinkStream(
         endpoint, None, poses, lambda: NOW_NS, lambda kind, text: events.append(text), north_rad
@@ -221,6 +221,13 @@ def test_time_is_answered_and_garbage_is_not(autopilot: Autopilot) -> None:
         send_all(stream, [tracks(0, track("ada", 1.0))])
         assert autopilot.next("ODOMETRY").y == 1.0
     assert events == []
+
+
+@pytest.mark.parametrize("state", ["live", "late", "stale"])
+def test_heartbeat_has_the_state_of_the_positions(autopilot: Autopilot, state: str) -> None:
+    expected = mavutil.mavlink.MAV_STATE_ACTIVE if state == "live" else mavutil.mavlink.MAV_STATE_CRITICAL
+    with streaming(autopilot, positions=judged(state)):
+        assert autopilot.next("HEARTBEAT").system_status == expected
 
 
 def test_request_of_another_address_is_not_answered(autopilot: Autopilot) -> None:

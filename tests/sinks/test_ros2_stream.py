@@ -26,7 +26,7 @@ from ipsys_log.sinks.streams.ros2_messages import type_hash
 from ipsys_log.units import NS_PER_S
 from tests.ports import free_port
 from tests.sinks.open_sockets import exposed
-from tests.sinks.streaming import START_NS, STEP_NS, TOPIC, moving_track, send_all, track, tracks
+from tests.sinks.streaming import START_NS, STEP_NS, TOPIC, judged, moving_track, send_all, track, tracks
 from tests.sinks.zenoh_listener import ZenohListener, open_node
 from tests.waiting import wait_until
 
@@ -56,7 +56,7 @@ def streaming(
         free_port() if port is None else port,
         options.pop("domain", 0),
         options.pop("host", None),
-        PoseSource({TOPIC}, now_ns, 7),
+        PoseSource({TOPIC}, now_ns, 7, positions=options.pop("positions", None)),
         now_ns,
         lambda kind, text: events.append(text),
         options.pop("heights_m", {"ada": 0.1, "bob": None}),
@@ -192,13 +192,15 @@ def test_stale_and_extrapolated_poses_are_withheld_and_diagnosed() -> None:
     assert [(status.name, status.level) for status in first.status] == [("ipsys: ada", 0), ("ipsys: bob", 1)]
     values = {value.key: value.value for value in first.status[0].values}
     assert values == {"session": "7", "age_s": "0.000", "cameras": "red", "sigma_m": "0.0100"}
-    with streaming(age_s=0.6) as (stream, _), listening(stream, "/tf", "/diagnostics") as listener:
+    late = streaming(age_s=0.6, positions=judged("late"))
+    with late as (stream, _), listening(stream, "/tf", "/diagnostics") as listener:
         send_all(stream, [tracks(0, track("ada", 1.0))])
         status = listener.messages("/diagnostics")[-1].status
         assert "/tf" not in listener.topics()
     assert [(row.level, row.message) for row in status] == [
         (3, "no position for 0.6 s"),
         (3, "no camera has seen the robot"),
+        (1, "late: 0.4 s. The cause. The remedy"),
     ]
 
 

@@ -27,6 +27,7 @@ from tests.sinks.streaming import (
     START_NS,
     STEP_NS,
     TOPIC,
+    judged,
     moving_track,
     send_all,
     track,
@@ -88,6 +89,15 @@ def test_receiver_gets_the_poses_of_a_played_log(tmp_path: Path, listening: sock
     assert of_ada[-1]["vx_m_s"] == pytest.approx(0.25, abs=1e-6)
     assert of_ada[0]["covariance_m2"] == pytest.approx((np.eye(3) * 1e-4).ravel().tolist())
     assert of_ada[0]["outside"] is False
+
+
+def test_datagram_says_whether_all_positions_are_late() -> None:
+    datagrams = [
+        json.loads(encode_pose(pose))
+        for options in ({}, {"positions": judged("live")}, {"positions": judged("late")})
+        for pose in poses_of([tracks(0, track("ada", 1.0))], source(**options))
+    ]
+    assert [datagram.get("late") for datagram in datagrams] == [None, False, True]
 
 
 def test_receiver_drops_old_repeated_and_foreign_datagrams(listening: socket.socket) -> None:

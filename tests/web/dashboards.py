@@ -36,6 +36,7 @@ from ipsys_log.messages import (
     Tracks,
     image_topic,
 )
+from ipsys_log.statistics.latency import PositionMonitor
 from ipsys_log.units import NS_PER_S
 from tests.playing import WAIT_LIMIT_S
 from tests.stages.drawing import jpeg
@@ -74,8 +75,10 @@ class LiveLab:
         self.states = {name: CameraState(frames=30, up=True, delay_s=0.004) for name in cameras}
         self.checks = {"red": FrameCheck((0,), (), 120.0, 1.0, ("the image is blurred: add light",))}
         setting = DashboardSetting(
-            rig, lenses or {}, model, "poly", self.states, self.checks, log, self.now_ns, tuple(streams)
+            *(rig, lenses or {}, model, "poly", self.states, self.checks, log, self.now_ns, tuple(streams)),
+            positions=PositionMonitor(self.now_ns, self.states, self.said.append),
         )
+        self._note = setting.positions
         self.operator = Operator(self.write, self.now_ns, self.said.append)
         self.dashboard = Dashboard(setting, self.operator)
         self._queue: queue.SimpleQueue[Message | threading.Event | None] = queue.SimpleQueue()
@@ -95,6 +98,8 @@ class LiveLab:
         """Let the sink consume messages; return after that."""
         consumed = threading.Event()
         for message in messages:
+            if self._note is not None:
+                self._note(message)
             self._queue.put(message)
         self._queue.put(consumed)
         assert consumed.wait(WAIT_LIMIT_S)
@@ -143,9 +148,9 @@ def markers(time_ns: int, camera: str = "red", marker_id: int = 0) -> Message:
     return Message(f"/runs/edges/cameras/{camera}/markers", time_ns, time_ns, payload, camera)
 
 
-def latency(time_ns: int) -> Message:
+def latency(time_ns: int, waited_s: float = 0.0) -> Message:
     """A position that took 10 ms to detect, 1 ms to locate, 2 ms to fuse and 1 ms to publish."""
-    steps_ms = np.cumsum([5, 10, 1, 2, 1]) * 1_000_000
+    steps_ms = np.cumsum([5, 10 + round(waited_s * 1000), 1, 2, 1]) * 1_000_000
     return Message(
         LATENCY_TOPIC, time_ns, time_ns, Latency(time_ns, "red", *(time_ns + steps_ms).tolist()), "red"
     )

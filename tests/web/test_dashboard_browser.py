@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from ipsys_log.messages import CameraModel, Model
+from ipsys_log.units import NS_PER_S
 from tests.web.contrast import low_contrasts
 from tests.web.dashboards import BEGIN_NS, LiveLab, event, frame, latency, markers, page_of, robot, tracks
 from tests.web.phone import Phone
@@ -164,6 +165,7 @@ def test_page_shows_the_newest_state_after_a_lost_network(browser: Phone, lab: L
         # Meanwhile the recording goes on.
         lab.run(5)
         lab.feed(tracks(lab.time_ns, robot(1, 3.0, 2.0)), event(lab.time_ns, "camera_back", "white is back"))
+        lab.feed(markers(lab.time_ns), latency(lab.time_ns))
         lose_network(browser, False)
         says(browser, "#state", "live")
         says(browser, "#events", "white is back")
@@ -172,6 +174,22 @@ def test_page_shows_the_newest_state_after_a_lost_network(browser: Phone, lab: L
     # The lost network is the only error.
     assert all('"network"' in text for text in browser.console)
     browser.console.clear()
+
+
+def test_late_positions_are_not_live(browser: Phone, lab: LiveLab) -> None:
+    with page_of(lab.dashboard) as page, opened(browser, page.url, PHONE):
+        says(browser, "#state", "live")
+        lab.run(14)
+        lab.states["red"].frames += 90
+        lab.feed(markers(lab.time_ns), latency(lab.time_ns - 14 * NS_PER_S, 14.0))
+        says(browser, "#state", "late: 14.0 s")
+        says(browser, "#cause", "frames/s. Use fewer or smaller images")
+        assert browser.run("getComputedStyle(document.querySelector('#state')).color") == "rgb(161, 18, 27)"
+        for scheme in ("light", "dark"):
+            browser.prefer(scheme)
+            assert low_contrasts(browser) == [], scheme
+        lab.run(5)
+        says(browser, "#state", "stale: 19.0 s")
 
 
 @pytest.mark.parametrize("size", [PHONE, WALL], ids=["phone", "wall"])

@@ -23,10 +23,12 @@ from tests.cli.test_stream_command import started, stop
 from tests.conftest import Ipsys
 from tests.sinks.streaming import write_tracks
 from tests.test_bad_input import refused
+from tests.web.axe import serious_faults
+from tests.web.contrast import low_contrasts
 from tests.web.dashboards import page_of
 from tests.web.phone import Phone
 from tests.web.test_access import Caller
-from tests.web.test_dashboard_page import Reader, post
+from tests.web.test_dashboard_page import Reader, cookie_of, post
 from tests.web.test_measuring_page import says
 
 FAST = 10.0
@@ -143,6 +145,73 @@ def test_command_serves_a_log_without_a_stream(tmp_path: Path) -> None:
             assert {row["name"] for row in robots} <= {"ada", "bob"}
     finally:
         stop(program)
+
+
+def test_device_that_operates_plays_the_log(tmp_path: Path) -> None:
+    log = write_tracks(tmp_path / "x.mcap")
+    with shown(log) as (player, url), closing(Reader(url)) as reader:
+        caller = Caller(url)
+        assert post(caller, "/api/play", {"rate": 5})[1]["rate"] == player.rate == 5
+        assert post(caller, "/api/play", {"seconds": 1.2})[1]["seconds"] == pytest.approx(1.2, abs=0.05)
+        # A paused page shows the robots at the new time.
+        robots = reader.until("robots", lambda data: data["robots"])["robots"]
+        ada = next(row for row in robots if row["name"] == "ada")
+        assert ada["x"] <= 1 + 0.25 * 1.2
+        reader.until("robots", lambda data: any(row["x"] == pytest.approx(1.29) for row in data["robots"]))
+        assert player.position_s == pytest.approx(1.2)
+        for body in ({"rate": 0}, {"rate": "fast"}, {"seconds": True}, {"seconds": float("nan")}):
+            assert post(caller, "/api/play", body)[0] == 400
+        assert (player.is_paused, player.rate) == (True, 5)
+        assert post(caller, "/api/play", {"is_paused": False})[1]["is_paused"] is False
+        player.stop()
+
+
+def test_device_that_views_cannot_play_the_log(tmp_path: Path) -> None:
+    player = Player([write_tracks(tmp_path / "x.mcap")], has_dashboard=True)
+    assert player.scene is not None
+    with page_of(dashboard_of_player(player, player.scene), "127.0.0.1") as page, player:
+        assert page.view_url is not None
+        caller, viewer, operator = Caller(page.url), cookie_of(page.view_url), cookie_of(page.url)
+        assert post(caller, "/api/play", {"is_paused": True}, **viewer)[0] == 403
+        assert post(caller, "/api/play", {"is_paused": True}, **operator)[0] == 200
+        scenes = [json.loads(caller.ask("GET", "/api/scene", **one)[1]) for one in (viewer, operator)]
+        assert [scene["may_play"] for scene in scenes] == [False, True]
+        player.stop()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [(390, 844), (1280, 900)], ids=["phone", "desktop"])
+def test_browser_plays_pauses_and_seeks(recorded: Path, browser: Phone, size: tuple[int, int]) -> None:
+    with shown(recorded, loop=True) as (player, url):
+        browser.open(url, size)
+        says(browser, "#play", "Play")
+        browser.tap("#play")
+        says(browser, "#state", "playing")
+        browser.tap("#play")
+        says(browser, "#state", "paused")
+        browser.run(
+            "(e => { e.value = 0.5 * e.max; e.dispatchEvent(new Event('change')); })"
+            "(document.querySelector('#seek'))"
+        )
+        browser.wait("document.querySelectorAll('#floor .other, #floor .robot').length > 0")
+        browser.wait("document.querySelectorAll('#robots tbody tr').length > 0")
+        assert player.position_s == pytest.approx(0.5 * player.duration_s, abs=0.5)
+        browser.run(
+            "(e => { e.value = '0.25'; e.dispatchEvent(new Event('change')); })"
+            "(document.querySelector('#rate'))"
+        )
+        says(browser, "#recording", "× 0.25, paused")
+        browser.tap("#play")
+        says(browser, "#state", "playing × 0.25")
+        assert browser.run("document.documentElement.scrollWidth") <= size[0]
+        for scheme in ("light", "dark"):
+            browser.prefer(scheme)
+            assert low_contrasts(browser) == [], scheme
+        assert serious_faults(browser) == []
+        player.stop()
+        says(browser, "#state", "playback ended")
+        browser.wait("document.querySelector('#player').hidden")
+        assert browser.console == []
 
 
 @pytest.mark.slow

@@ -17,6 +17,7 @@ from rich.text import Text
 
 from ipsys_log.app.report.rows import counted
 from ipsys_log.plain_text import plain_text
+from ipsys_log.units import format_duration
 
 if TYPE_CHECKING:
     from ipsys_log.engine.provenance import Outcome
@@ -28,6 +29,10 @@ _MANY_RUNS = 4
 _LONGEST = 10_000
 # A step with more messages than this prints more than one line in a pipe; its bar leaves some out.
 _LONG_STEP = 100
+# An evaluation takes so many times the fit of its model: 5 to 12 times in the small sample.
+_EVALUATION_FITS = 8
+# The duration of shorter work is not said.
+_LONG_S = 10.0
 
 
 class SafeConsole(Console):
@@ -84,9 +89,39 @@ def print_warnings() -> Iterator[None]:
         logger.propagate = propagate
 
 
+def say_durations(show: Progress, jobs: int, *, of_models_only: bool) -> Progress:
+    """Return a progress function that also says how long work of more than 10 s takes.
+
+    It says this before the evaluation of several models, and after a tenth of any other step.
+    """
+    begun_s: dict[str, float] = {}
+    said: set[str] = set()
+    fits_s = 0.0
+
+    def note(stage: str, done: int, total: int | None) -> None:
+        nonlocal fits_s
+        now_s = monotonic()
+        if done == 0 or stage not in begun_s:
+            begun_s[stage] = now_s
+            said.discard(stage)
+        took_s, left_s = now_s - begun_s[stage], 0.0
+        if stage == "fits":
+            fits_s = took_s
+        if total and stage == "models" and done == 0:
+            left_s = _EVALUATION_FITS * fits_s / min(jobs, total)
+        elif total and 10 * done >= total and " " not in stage and not of_models_only:
+            left_s = took_s * (total - done) / done
+        if left_s > _LONG_S and stage not in said:
+            said.add(stage)
+            say(f"{stage}: about {format_duration(left_s)} left")
+        show(stage, done, total)
+
+    return note
+
+
 @contextmanager
 def progress_bar(
-    frame_steps: Collection[str] | None = None, lines_in_pipe: bool = False
+    frame_steps: Collection[str] | None = None, lines_in_pipe: bool = False, jobs: int = 1
 ) -> Iterator[Progress]:
     """Yield the progress function; it shows a bar for each working step on a terminal.
 
@@ -95,7 +130,9 @@ def progress_bar(
     Parameters
     ----------
     frame_steps : names of the steps that count frames: their bars show a rate. Default: the causal stages.
-    lines_in_pipe : print lines in a file or a pipe, as :func:`progress_lines`; otherwise nothing.
+    lines_in_pipe : print lines in a file or a pipe, as :func:`progress_lines`; otherwise only the duration
+        of long work.
+    jobs : number of processes that evaluate several models.
     """
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
@@ -107,7 +144,8 @@ def progress_bar(
         TimeRemainingColumn(),
     )
     if not remarks.is_terminal:
-        yield progress_lines() if lines_in_pipe else lambda stage, done, total: None
+        lines = progress_lines() if lines_in_pipe else lambda stage, done, total: None
+        yield say_durations(lines, jobs, of_models_only=False)
         return
     if frame_steps is None:
         from ipsys_log.engine.graph import STAGES
@@ -135,7 +173,7 @@ def progress_bar(
             rate = f"{speed:,.0f} frames/s" if speed and stage in frame_steps else ""
             bar.update(bars[stage], completed=done, rate=rate)
 
-        yield show
+        yield say_durations(show, jobs, of_models_only=True)  # the bars show the time of the others
 
 
 def progress_lines() -> Progress:

@@ -33,6 +33,8 @@ SENT_NOW = "the camera images"
 MODEL = "the log with the model"
 # Duration of the frames that are kept for a measured point.
 _PLACE_S = 1.5
+# The first frame is processed within this time, also on a busy computer.
+_FIRST_FRAME_S = 60.0
 
 
 def prepare_lab(
@@ -139,14 +141,15 @@ def open_cameras(
     with ExitStack() as stack:
         with remarks.status("opening " + ", ".join(lab.names)):
             opened = stack.enter_context(open_lab(lab, say))
-        stack.enter_context(_stop_after(opened.cameras.stop, seconds, until_stopped))
+        begun = stack.enter_context(_stop_after(opened.cameras.stop, seconds, until_stopped))
         room = opened.room(output)
         # A log without a recording grows only with measured points.
         growing = None if doing and seconds is None else room.bytes_per_s
         monitor = stack.enter_context(CameraMonitor(lab.rig))
         status = LiveStatus(
-            opened.cameras.states, monitor, output, monotonic, growing, None if doing else say
-        )
+            opened.cameras.states, monitor, output, monotonic, growing, None if doing else say,
+            cameras=lab.cameras, positions=opened.cameras.positions, begun=begun,
+        )  # fmt: skip
         _say_room(opened, room, seconds, doing)
         say(doing or "the cameras are open; Ctrl-C to end")
         if panel:
@@ -173,17 +176,30 @@ def _say_room(opened: OpenLab, room: DiskRoom, seconds: float | None, doing: str
 
 
 @contextmanager
-def _stop_after(stop: Callable[[], None], seconds: float | None, on_signal: bool = True) -> Iterator[None]:
-    """Stop in order after some time, or on the first signal: messages that arrived before are written."""
+def _stop_after(
+    stop: Callable[[], None], seconds: float | None, on_signal: bool = True
+) -> Iterator[Callable[[], None]]:
+    """Stop in order after some time, or on the first signal: messages that arrived before are written.
+
+    The time begins with a call of the yielded function. If none comes for long, it begins without.
+    """
     if on_signal:
         stop_on_signal(stop)
-    timer = Timer(TIMEOUT_MAX if seconds is None else seconds, stop)
-    timer.daemon = True
-    timer.start()
+    timers: list[Timer] = []
+
+    def begin(after_s: float = 0.0) -> None:
+        for timer in timers:
+            timer.cancel()
+        timers.append(Timer(TIMEOUT_MAX if seconds is None else after_s + seconds, stop))
+        timers[-1].daemon = True
+        timers[-1].start()
+
+    begin(_FIRST_FRAME_S)
     try:
-        yield
+        yield begin
     finally:
-        timer.cancel()
+        for timer in timers:
+            timer.cancel()
 
 
 def _on_screen(status: LiveStatus) -> AbstractContextManager[object]:

@@ -113,7 +113,7 @@ def serve_dashboard(
     from ipsys_log.app.web.dashboard.app import dashboard_of_recording
 
     dashboard = dashboard_of_recording(opened, status.checks, log, plan.model, run, streams)
-    with _serve(dashboard, plan.host, plan.port, has_viewers=True):
+    with _serve(dashboard, plan.host, plan.port):
         yield [dashboard]
 
 
@@ -142,18 +142,17 @@ def serve_playback(player: Player, host: str | None, port: int) -> Iterator[None
 
     dashboard = dashboard_of_player(player, player.scene)
     player.show_on(dashboard)
-    # A log is not changed: all devices may only view.
-    with _serve(dashboard, host, port, has_viewers=False):
+    with _serve(dashboard, host, port):
         yield
 
 
 @contextmanager
-def _serve(dashboard: Dashboard, host: str | None, port: int, has_viewers: bool) -> Iterator[None]:
+def _serve(dashboard: Dashboard, host: str | None, port: int) -> Iterator[None]:
     from ipsys_log.app.web.dashboard.app import build_dashboard
     from ipsys_log.app.web.server import serve_app
 
     app = build_dashboard(dashboard)
-    with serve_app(app, host, port, has_viewers=has_viewers, option="--web-port") as page:
+    with serve_app(app, host, port, has_viewers=True, option="--web-port") as page:
         _print_addresses(page, is_secret=host is not None)
         try:
             yield
@@ -162,7 +161,7 @@ def _serve(dashboard: Dashboard, host: str | None, port: int, has_viewers: bool)
 
 
 def _print_addresses(page: PageServer, is_secret: bool) -> None:
-    """Print the address of the page; of a recording with secrets, one to view and one to operate."""
+    """Print the address of the page; with secrets, one to view and one to operate."""
     from ipsys_log.app.web.server import qr_code
 
     if page.view_url is None:

@@ -249,7 +249,11 @@ def plan(
         in_force, all_lenses = lab_of_run(session, run, given_rig, lenses)
         from ipsys_log.live_runs.survey.floor_plan import plan_floor  # after the bar of the fit has begun
 
-        planned = plan_floor(session, run, in_force, all_lenses, places, height_m or ())
+        with progress_bar(()) as progress:
+            planned = plan_floor(
+                *(session, run, in_force, all_lenses, places, height_m or ()),
+                progress=lambda done, total: progress("plan", done, total),
+            )
     _show(planned, plot, as_json)
 
 

@@ -183,7 +183,7 @@ def derive(
     with one_reading():
         logs, output = choose_target(logs, output)
         request = _request(logs, **given)
-        with say_kept(_kept_runs(logs, output, again)), progress_bar() as progress:
+        with say_kept(_kept_runs(logs, output, again)), progress_bar(jobs=jobs) as progress:
             outcomes = pipeline.replay(logs, request, until, output, progress, say, jobs)
         # A new log exists only if there was something to write.
         written = [output] if output is not None and output.exists() else []

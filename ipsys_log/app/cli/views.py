@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
 
-from ipsys_log.app.cli.console import console, progress_bar, say
+from ipsys_log.app.cli.console import console, progress_bar, remarks, say
 from ipsys_log.app.cli.options import ReadLogs, setting, switch, with_options
 from ipsys_log.app.cli.stages import derive, options_until
 from ipsys_log.app.report.files import FIGURE_SUFFIXES, check_figure_file, check_file, write_files
 from ipsys_log.errors import IpsysError
 from ipsys_log.extras import check_installed
 from ipsys_log.log.location import LogLocation, file_beside
+from ipsys_log.plain_text import shell_words
 
 _COUNTED = ("bag", "video", "pictures")
 Runs = Annotated[
@@ -49,7 +52,7 @@ The page needs no network. Without calibration points, it has no accuracy. For a
 the errors of the robots, and figure 12 of the paper.
 
 Without options of stages, the page shows the evaluations in the log; ipsys evaluate adds more. A log that has
-none gets those of all models first.
+none gets those of all models first; on a terminal, the command asks before.
 
 Examples
 
@@ -149,11 +152,18 @@ def _report(logs: Sequence[LogLocation], output: Path | None, html: Path | None,
         has_points = bool(session.topics(MEASUREMENTS))
         asked = any(given[name] and given[name] != default for name, (_, default) in _DERIVED.items())
         evaluated = [] if asked else newest_evaluations(session)
-        if any(one.out_of_date for one in evaluated):  # these models again, and no others
+        is_old = any(one.out_of_date for one in evaluated)
+        computes = has_points and (is_old or not evaluated)
+        if computes and not asked:
+            computes = _may_evaluate([one.method for one in evaluated])
+            if not (computes or evaluated):
+                say(f"no page was written; with one model: ipsys report {shell_words(*logs)} --model poly")
+                return
+        if computes and is_old:  # these models again, and no others
             given["model"], evaluated = [one.method for one in evaluated], []
-        if evaluated or not has_points:
+        if not computes:
             page = render_report(session, read_accuracy(session, [one.run for one in evaluated]))
-    if has_points and not evaluated:
+    if computes:
         with derive(logs, "evaluate", output, again="use ipsys evaluate", **given) as (
             session,
             _,
@@ -166,6 +176,20 @@ def _report(logs: Sequence[LogLocation], output: Path | None, html: Path | None,
         say("the session has no calibration points: the page shows the recording and its runs")
     elif evaluated:
         say(f"evaluated before: {', '.join(one.method for one in evaluated)}; to add models: ipsys evaluate")
+
+
+def _may_evaluate(out_of_date: Sequence[str]) -> bool:
+    """Ask on a terminal whether to evaluate models, which can take minutes; elsewhere return True."""
+    if not (sys.stdin.isatty() and remarks.is_terminal):
+        return True
+    from ipsys_log.app.cli.dialog import LetterError, agreed
+
+    text = "no model is evaluated yet. Evaluate all models now?"
+    if out_of_date:
+        text = f"out of date: {', '.join(out_of_date)}. Evaluate these models again?"
+    with suppress(LetterError):
+        return agreed(f"{text} This can take minutes.", True)
+    return False
 
 
 _options = options_until("evaluate")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from math import degrees
 from pathlib import Path
 
@@ -14,12 +14,15 @@ from ipsys_log.app.report.rows import Rows, cm, ms, percent
 from ipsys_log.capture.disk import DiskRoom
 from ipsys_log.capture.frames import CameraState
 from ipsys_log.capture.live_check import CameraMonitor, FrameCheck
-from ipsys_log.messages import CompressedImage, CompressedVideo, Markers, Message, Track, Tracks
+from ipsys_log.messages import CompressedImage, CompressedVideo, Markers, Message, RigCamera, Track, Tracks
 from ipsys_log.statistics.disagreement import OverlapSummary
+from ipsys_log.statistics.latency import PositionMonitor
 from ipsys_log.units import NS_PER_S, format_bytes, format_duration
 
 # After this time, the measured growth of a log is better than the estimate.
 _SETTLED_S = 5.0
+# A camera below this share of its frames is named, after a recording of this time at least.
+_DELIVERED, _SHORTEST_S = 0.9, 2.0
 # More robots than these do not fit into a window of 24 lines; as many ids of markers fit into a line.
 _MOST_ROBOTS, _MOST_IDS = 10, 8
 
@@ -34,7 +37,9 @@ class LiveStatus:
     now_s : clock for the rates.
     expected_bytes_per_s : growth of the log, until it can be measured; None if it does not grow with time.
     say : called once, with the path of the log, when the first frame is in the file.
-
+    cameras : the requested rates.
+    positions : the state of the positions.
+    begun : called with the first frame that the stages have processed.
     """
 
     def __init__(
@@ -45,7 +50,13 @@ class LiveStatus:
         now_s: Callable[[], float],
         expected_bytes_per_s: float | None = None,
         say: Callable[[str], None] | None = None,
+        *,
+        cameras: Sequence[RigCamera] = (),
+        positions: PositionMonitor | None = None,
+        begun: Callable[[], None] | None = None,
     ) -> None:
+        self._cameras, self._positions, self._begun = cameras, positions, begun
+        self._frames_ns: tuple[int, int] | None = None
         self._states, self._monitor, self.log, self._now_s = states, monitor, target, now_s
         self._begin_s = now_s()
         self._say, self._size_with_frame = say, 0
@@ -65,6 +76,11 @@ class LiveStatus:
         """Handle one recorded message."""
         self._announce(message)
         self._monitor(message)
+        if isinstance(message.payload, (CompressedImage, CompressedVideo, Markers)):
+            time_ns = message.log_time_ns
+            if self._frames_ns is None and self._begun is not None:
+                self._begun()
+            self._frames_ns = (self._frames_ns or (time_ns, time_ns))[0], time_ns
         begin_ns, end_ns = self._span_ns or (message.log_time_ns, message.log_time_ns)
         self._span_ns = min(begin_ns, message.log_time_ns), max(end_ns, message.log_time_ns)
         self._overlap(message)
@@ -94,6 +110,9 @@ class LiveStatus:
         parts: list[Rows | Text] = [cameras_table(self._states, self._monitor.checks, self._rates)]
         if self._tracks:
             parts.append(robots_table(self._tracks))
+        positions = None if self._positions is None else self._positions.state
+        if positions is not None and (self._tracks or positions.remedy):
+            parts.append(Text(f"positions are {positions}", style="bold red" if positions.remedy else ""))
         parts += [Text(line) for line in self._overlap.lines()]
         # As Text: rich would read brackets in a plain string as its markup.
         parts += [Text(line, style="yellow") for line in self._warnings()]
@@ -132,7 +151,26 @@ class LiveStatus:
             dropped = f", {state.dropped} dropped: the disk is too slow" if state.dropped else ""
             missed = f", {state.missed} lost before arrival" if state.missed else ""
             lines.append(f"camera {name}: {state.frames} frames{dropped}{missed}")
-        return lines + self._overlap.lines() + self._warnings()
+        return lines + self._slow_cameras() + self._overlap.lines() + self._warnings()
+
+    def _slow_cameras(self) -> list[str]:
+        """Return a line for each camera that has delivered fewer frames than the rig asks for."""
+        begin_ns, end_ns = self._frames_ns or (0, 0)
+        span_s = (end_ns - begin_ns) / NS_PER_S
+        lines = []
+        for camera in self._cameras:
+            source, asked_hz, state = str(camera.source), camera.rate_hz, self._states[camera.name]
+            arrived = state.frames + state.dropped
+            # A file may end before the recording.
+            if asked_hz is None or source.startswith("file:") or span_s < _SHORTEST_S:
+                continue
+            if arrived < _DELIVERED * asked_hz * span_s:
+                cause = "check its exposure_s, its cable and the load of this computer, or"
+                if source.startswith("sim:"):
+                    cause = "this computer draws its images too slowly;"
+                rates = f"{arrived / span_s:.1f} of {asked_hz:g} frames/s"
+                lines.append(f"camera {camera.name} delivers {rates}: {cause} lower rate_hz in the rig")
+        return lines
 
     def _rate(self, name: str, state: CameraState, now_s: float) -> tuple[float, float]:
         before_s, frames, size = self._before.get(name, (self._begin_s, 0, 0))

@@ -33,6 +33,7 @@ from ipsys_log.messages import (
     image_topic,
 )
 from ipsys_log.sinks.streams.poses import PoseSource
+from ipsys_log.statistics.latency import PositionMonitor
 from ipsys_log.units import NS_PER_S
 
 
@@ -216,6 +217,7 @@ class LockstepCameras:
     steering : set before the iteration.
     states : states of the cameras, by name.
     received_ns : arrival times of the frames, by log time.
+    positions : the state of the positions.
     fault : the error of a robot that ended the run.
     """
 
@@ -225,6 +227,7 @@ class LockstepCameras:
         self.clock, self.say = clock, say
         self.states = {name: CameraState(format="jpeg", up=True) for name in run.lab.cameras}
         self.received_ns: dict[int, int] = {}
+        self.positions = PositionMonitor(clock.now_ns, self.states, say)
         self.steering: Steering
         self.fault: IpsysError | None = None
         self._run, self._lab, self._sync, self._clock = run, lab, sync, clock

@@ -13,6 +13,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Array, CameraCalibration, CameraModel, Model, Rig
 from ipsys_log.messages.channels import MEASUREMENTS, MODEL
+from ipsys_log.messages.stage import Progress
 from ipsys_log.models.plain_models import rigid_transform
 from ipsys_log.models.table import AppliedModel, reads_corners
 from ipsys_log.models.uncertainty import Uncertainty
@@ -88,7 +89,13 @@ class PlannedFloor:
 
 
 def plan_floor(
-    session: Session, run: str, rig: Rig, lenses: Lenses, count: int, heights_m: Sequence[float] = ()
+    session: Session,
+    run: str,
+    rig: Rig,
+    lenses: Lenses,
+    count: int,
+    heights_m: Sequence[float] = (),
+    progress: Progress = lambda done, total: None,
 ) -> PlannedFloor:
     """Plan the next points to measure for the fitted model of a run.
 
@@ -99,6 +106,7 @@ def plan_floor(
     rig, lenses : rig and intrinsics in force; ``lenses`` by camera.
     count : number of points to plan.
     heights_m : possible heights of a marker; empty for the heights that were used so far.
+    progress : called after each point.
 
     Raises
     ------
@@ -107,7 +115,7 @@ def plan_floor(
     """
     model: Model = session.payloads(session.topics(MODEL, run))[-1]
     if reads_corners(model.name):
-        return _plan_corner_model(session, model, run, rig, lenses, count, heights_m)
+        return _plan_corner_model(session, model, run, rig, lenses, count, heights_m, progress)
     views = [
         view_of_model(model.name, camera, lenses.get(camera.camera))
         for camera in model.cameras
@@ -129,6 +137,7 @@ def plan_floor(
         _tape(session, rig),
         _RADIUS * side_m,
         count,
+        progress,
     )
     notes = tuple(_notes(model, rig, lenses, plan))
     return PlannedFloor(model.name, run, rig, plan, grid.xs_m, grid.ys_m, height_m, measured_m, notes)
@@ -142,6 +151,7 @@ def _plan_corner_model(
     lenses: Lenses,
     count: int,
     heights_m: Sequence[float],
+    progress: Progress,
 ) -> PlannedFloor:
     """Plan points and a drive for a model of corners: its covariance gives their effect."""
     # Late: scipy takes 1 s, and plans of other models do not need these.
@@ -162,7 +172,7 @@ def _plan_corner_model(
     expected = expect_on_floor(models, sizes_px, grid, height_m, side_m)
     candidates_m = _candidates(rig, low_m, high_m, _COARSE * grid.step_m, side_m / 2, heights_m or [0.0])
     tape_m2 = _tape_covariances(session, rig)
-    plan = plan_joint_points(models, sizes_px, expected, candidates_m, tape_m2, side_m, count)
+    plan = plan_joint_points(models, sizes_px, expected, candidates_m, tape_m2, side_m, count, progress)
     drive = choose_drive(models, sizes_px, expected, low_m, high_m, height_m, side_m)
     notes = tuple(_joint_notes(rig, {*models}))
     return PlannedFloor(model.name, run, rig, plan, grid.xs_m, grid.ys_m, height_m, measured_m, notes, drive)

@@ -34,8 +34,10 @@ from ipsys_log.sinks.streams.foxglove_messages import (
     pack_time,
     write_advertise,
     write_server_info,
+    write_status,
 )
 from ipsys_log.sinks.streams.poses import NewSession, StreamContext
+from ipsys_log.statistics.latency import PositionMonitor
 
 _BACKLOG = 16
 _MOST_CLIENTS = 32
@@ -45,6 +47,7 @@ _MOST_WAITING = 64
 _LARGEST_MESSAGE = 1 << 16  # bytes, of a client
 _MOST_REFUSALS = 10  # events; others could fill the log
 _MOST_CHANNELS = 1000
+_STATUS_S = 1.0
 # The app in a browser, and the desktop app; a page of a file has the origin "null" in a browser.
 _ORIGINS = frozenset({"https://app.foxglove.dev", "https://app.foxglove.com", "file://"})
 # A later subscriber gets the last message of these types.
@@ -70,6 +73,7 @@ class FoxgloveStream:
     topics : the topics of the tracks, announced before the first message.
     with_images : send images, too.
     is_replayed : the times are those of a recording; clients get them as the time of the server.
+    positions : clients get a status if the positions of a live run are late or stale.
 
     Raises
     ------
@@ -87,7 +91,9 @@ class FoxgloveStream:
         warn: Warn,
         with_images: bool = False,
         is_replayed: bool = False,
+        positions: PositionMonitor | None = None,
     ) -> None:
+        self._positions, self._status = positions, ""
         images = (*IMAGES.payloads, SkippedVideo)
         shown = {payload for payload in PAYLOADS.values() if with_images or payload not in images}
         self.payloads: tuple[type, ...] = (*shown, NewSession, *(images if with_images else ()))
@@ -168,7 +174,10 @@ class FoxgloveStream:
             close_timeout=1,
             logger=_LOGGER,
         ) as server:
-            await self._ended.wait()
+            while not self._ended.is_set():
+                self._send_status()
+                with suppress(TimeoutError):
+                    await asyncio.wait_for(self._ended.wait(), _STATUS_S)
             # A stalled client would delay the end.
             for connection in server.connections:
                 connection.transport.abort()
@@ -217,6 +226,8 @@ class FoxgloveStream:
         client = Client(connection, self.drops)
         client.put(write_server_info("ipsys", self._session, self._is_replayed))
         client.put(write_advertise(list(self._channels.values())))
+        if self._status:
+            client.put(write_status(self._status))
         self._clients |= {client}
         try:
             async for text in connection:
@@ -257,6 +268,17 @@ class FoxgloveStream:
         """Begin a session: a time that goes back makes Foxglove forget earlier messages."""
         self._session = session
         self._send_time(time_ns)
+
+    def _send_status(self) -> None:
+        """Send the state of the positions if it has changed and is a fault, or was one."""
+        state = None if self._positions is None else self._positions.state
+        text = (
+            "" if state is None or (state.state == "live" and not state.remedy) else f"positions are {state}"
+        )
+        if text != self._status:
+            self._status = text
+            for client in self._clients:
+                client.put(write_status(text))
 
     def _send_time(self, time_ns: int) -> None:
         if self._is_replayed and time_ns != self._time_ns:
@@ -304,4 +326,4 @@ def open_all(context: StreamContext) -> Iterator[FoxgloveStream]:
     if settings.foxglove is not None:
         where = settings.foxglove, settings.host, settings.secret
         inputs = context.session, context.topics, context.warn
-        yield FoxgloveStream(*where, *inputs, settings.images, context.is_replayed)
+        yield FoxgloveStream(*where, *inputs, settings.images, context.is_replayed, context.positions)

@@ -74,6 +74,13 @@ def pack_time(time_ns: int) -> bytes:
     return struct.pack("<BQ", _TIME, time_ns)
 
 
+def write_status(text: str) -> str:
+    """Return the message that shows a warning in place of the one before; an empty text removes it."""
+    if not text:
+        return json.dumps({"op": "removeStatus", "statusIds": ["positions"]})
+    return json.dumps({"op": "status", "level": 1, "message": text, "id": "positions"})
+
+
 class Subscriptions:
     """The subscriptions of a client: the number that it gave to each channel."""
 

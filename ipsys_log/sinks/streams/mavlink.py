@@ -244,15 +244,17 @@ class MavlinkStream:
             self.drops.add(str(error.strerror))
 
     def _beat(self) -> None:
-        """Tell the autopilot once a second that this program runs."""
+        """Tell the autopilot once a second that this program runs, and whether positions are in time."""
         while True:
+            state = self._poses.state
+            is_live = state is None or state.state == "live"
             self._send(
                 common.MAVLink_heartbeat_message(
                     common.MAV_TYPE_ONBOARD_CONTROLLER,
                     common.MAV_AUTOPILOT_INVALID,
                     0,
                     0,
-                    common.MAV_STATE_ACTIVE,
+                    common.MAV_STATE_ACTIVE if is_live else common.MAV_STATE_CRITICAL,
                     3,  # the version of the protocol
                 )
             )

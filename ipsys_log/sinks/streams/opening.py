@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
-from dataclasses import fields
+from dataclasses import fields, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Protocol
@@ -65,10 +65,11 @@ def open_live_streams(
     settings: StreamSettings, lab: OpenLab, run: str
 ) -> AbstractContextManager[list[Stream]]:
     """Open streams of the tracks of a run, for the robots of an open lab."""
-    now_ns, heights_m = lab.cameras.clock.now_ns, lab.rig.robot_heights_m()
+    cameras, heights_m = lab.cameras, lab.rig.robot_heights_m()
+    now_ns, topics = cameras.clock.now_ns, {TRACKS.topic_of(run)}
     session = first_session(now_ns())
-    topics = {TRACKS.topic_of(run)}
-    return open_streams(StreamContext(settings, topics, now_ns, lab.cameras.add_event, session, heights_m))
+    context = StreamContext(settings, topics, now_ns, cameras.add_event, session, heights_m)
+    return open_streams(replace(context, positions=cameras.positions))
 
 
 def check_streams(settings: StreamSettings) -> list[str]:

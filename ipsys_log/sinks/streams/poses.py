@@ -12,6 +12,7 @@ from ipsys_log.messages import Message, Track, Tracks
 from ipsys_log.messages.message import Mat33
 from ipsys_log.sinks.sink import Warn
 from ipsys_log.sinks.streams import STALE_S, StreamSettings
+from ipsys_log.statistics.latency import PositionMonitor, PositionState
 from ipsys_log.units import NS_PER_S
 
 # Tracks of earlier versions have no velocity. The duration of the poses that give one: a longer one is more
@@ -59,6 +60,7 @@ class StreamPose:
     session, sequence : both increase; the sequence begins with 1 in each session.
     time_ns, age_s : the capture time, and the time since then by the clock of the stream.
     is_stale : the last sighting of the robot is older than the limit.
+    is_late : all positions of the live run are late; None if this is unknown.
     is_outside : the position is an extrapolation outside the calibrated volume; None if this is unknown.
     """
 
@@ -69,6 +71,7 @@ class StreamPose:
     track: Track
     velocity: Velocity | None
     is_stale: bool
+    is_late: bool | None = None
 
     @property
     def is_outside(self) -> bool | None:
@@ -100,6 +103,7 @@ class PoseSource:
     now_ns : the clock of the ages.
     session : the number of the first session.
     stale_s : the age from which a pose is stale.
+    positions : the state of the positions of a live run.
     """
 
     def __init__(
@@ -109,7 +113,9 @@ class PoseSource:
         session: int,
         robots: Collection[str] = (),
         stale_s: float = STALE_S,
+        positions: PositionMonitor | None = None,
     ) -> None:
+        self._positions = positions
         self._topics, self._robots, self._now_ns = frozenset(topics), frozenset(robots), now_ns
         self._session, self._sequence, self._stale_s = session, 0, stale_s
         self._recent: dict[str, _Recent] = {}
@@ -124,25 +130,33 @@ class PoseSource:
         """The age from which a pose is stale, in s."""
         return self._stale_s
 
+    @property
+    def state(self) -> PositionState | None:
+        """The state of all positions of a live run; None if it is not known."""
+        return None if self._positions is None else self._positions.state
+
     def read(self, message: Message) -> Iterator[StreamPose]:
         """Yield the poses of a message; a new session forgets all earlier poses."""
         if isinstance(message.payload, NewSession):
             self._session, self._sequence = message.payload.number, 0
             self._recent.clear()
         elif message.topic in self._topics and isinstance(message.payload, Tracks):
+            state = self.state
+            is_late = None if state is None else state.state == "late"
             for track in message.payload.tracks:
                 if (not self._robots or track.robot in self._robots) and _is_finite(track):
-                    yield from self._poses(track, message.payload.timestamp)
+                    yield from self._poses(track, message.payload.timestamp, is_late)
 
-    def _poses(self, track: Track, time_ns: int) -> Iterator[StreamPose]:
+    def _poses(self, track: Track, time_ns: int, is_late: bool | None) -> Iterator[StreamPose]:
         recent = self._recent.setdefault(track.robot, _Recent())
         if not recent.add(time_ns, track):
             return
         self._sequence += 1
         age_s = (self._now_ns() - time_ns) / NS_PER_S
         unseen_s = age_s + (track.coasting_ns or 0) / NS_PER_S
+        is_stale = unseen_s > self._stale_s
         yield StreamPose(
-            self._session, self._sequence, time_ns, age_s, track, recent.velocity(), unseen_s > self._stale_s
+            self._session, self._sequence, time_ns, age_s, track, recent.velocity(), is_stale, is_late
         )
 
 
@@ -159,6 +173,7 @@ class StreamContext:
     heights_m : all robots of the rig, announced before they are seen, with the heights of their markers
         (None: unknown).
     is_replayed : the times are those of a recording.
+    positions : the state of the positions of a live run.
     """
 
     settings: StreamSettings
@@ -168,6 +183,7 @@ class StreamContext:
     session: int
     heights_m: Mapping[str, float | None] = field(default_factory=dict)
     is_replayed: bool = False
+    positions: PositionMonitor | None = None
 
     @property
     def streamed_heights_m(self) -> dict[str, float | None]:
@@ -178,7 +194,9 @@ class StreamContext:
     def poses(self, robots: Collection[str] = ()) -> PoseSource:
         """Return the poses of some robots; without names, those of the settings."""
         named = robots or self.settings.robots
-        return PoseSource(self.topics, self.now_ns, self.session, named, self.settings.stale_s)
+        return PoseSource(
+            self.topics, self.now_ns, self.session, named, self.settings.stale_s, self.positions
+        )
 
 
 def _finite(value: _Value | None) -> _Value | None:

@@ -153,7 +153,8 @@ class Ros2Stream:
             now_ns = self._now_ns()
             if number == 0 and is_stampable(now_ns):
                 newest = dict(self._newest)
-                text = ros2.encode_diagnostics(newest, self._poses.session, now_ns, self._poses.stale_s)
+                poses = self._poses
+                text = ros2.encode_diagnostics(newest, poses.session, now_ns, poses.stale_s, poses.state)
                 self._put("/diagnostics", ros2.DIAGNOSTICS, text)
 
 

@@ -19,6 +19,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.log.ros2 import ROS2_MODELS
 from ipsys_log.messages import CameraCalibration, CompressedImage, CompressedVideo, RawImage
 from ipsys_log.sinks.streams.poses import StreamPose, Velocity
+from ipsys_log.statistics.latency import PositionState
 from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.poses import quaternion
 
@@ -209,15 +210,26 @@ def encode_poses(poses: Iterable[tuple[StreamPose, float]]) -> Iterator[tuple[st
 
 
 def encode_diagnostics(
-    newest: Mapping[str, StreamPose | None], session: int, now_ns: int, stale_s: float
+    newest: Mapping[str, StreamPose | None],
+    session: int,
+    now_ns: int,
+    stale_s: float,
+    state: PositionState | None = None,
 ) -> bytes:
     """Return the message DiagnosticArray: a status for each robot, with the age and the accuracy of its pose.
+
+    The state of all positions of a live run has a status of its own.
 
     Parameters
     ----------
     newest : the newest pose of each robot; None: no camera has seen it.
     """
     rows = [_status(robot, pose, session, now_ns, stale_s) for robot, pose in newest.items()]
+    if state is not None:
+        status: Any = message_class("diagnostic_msgs/msg/DiagnosticStatus")
+        levels = {"live": status.WARN if state.remedy else status.OK, "late": status.WARN}
+        level = levels.get(state.state, status.STALE)
+        rows.append(status(level, "ipsys: positions", str(state), "", []))
     message = make("diagnostic_msgs/DiagnosticArray", make_header(now_ns, ""), rows)
     return encode(message, DIAGNOSTICS)
 

@@ -35,6 +35,7 @@ def encode_pose(pose: StreamPose, key: bytes | None = None) -> bytes:
         "time_ns": pose.time_ns,
         "age_s": round(pose.age_s, _DECIMALS),
         "stale": pose.is_stale,
+        "late": pose.is_late,
         "outside": pose.is_outside,
         "x_m": round(track.x_m, _DECIMALS),
         "y_m": round(track.y_m, _DECIMALS),

@@ -137,6 +137,7 @@ def build_dashboard(dashboard: Dashboard, setup: str | None = None) -> Starlette
             Route("/api/operate", answers.operate, methods=["POST"]),
             Route("/api/mark", answers.mark, methods=["POST"]),
             Route("/api/segment", answers.segment, methods=["POST"]),
+            Route("/api/play", answers.play, methods=["POST"]),
         ],
         exception_handlers=requests.ERROR_HANDLERS,
     )
@@ -187,6 +188,10 @@ class _Answers:
             operator.end_segment(number)
         return JSONResponse({})
 
+    async def play(self, request: Request) -> Response:
+        """Change the playback of a log; return its new state."""
+        return JSONResponse(self._dashboard.control(await requests.read_json(request)))
+
     def _operator(self) -> Operator:
         if self._dashboard.operator is None:
             raise IpsysError("this page only shows a log; nothing is recorded")
@@ -225,14 +230,15 @@ def dashboard_of_recording(
     seat : the seat of the device that operates, if another page has it, too.
     """
     cameras, now_ns = opened.cameras, opened.cameras.clock.now_ns
+    lab = opened.rig, opened.lenses, model, run
     setting = DashboardSetting(
-        opened.rig, opened.lenses, model, run, cameras.states, checks, log, now_ns, streams
+        *lab, cameras.states, checks, log, now_ns, streams, positions=cameras.positions
     )
     return Dashboard(setting, Operator(cameras.add, now_ns, cameras.say, seat))
 
 
 def dashboard_of_player(player: Player, scene: PlayedScene) -> Dashboard:
-    """Return the dashboard of a played log. It has no operator: a log is not changed."""
+    """Return the dashboard of a played log. It has a player and no operator: a log is not changed."""
     played = PlayedLog(player, scene)
     rig, lenses, model, run = scene.rig, scene.lenses, scene.model, scene.run
     log = Path(scene.name)

@@ -1,13 +1,14 @@
 // The dashboard. It shows the events of the server; only the server decides what a device may do.
 import { FloorMap } from "./map.js";
-import { Operation } from "./operate.js";
+import { Operation, PlayerBar } from "./operate.js";
 import { showRobots, showStatus } from "./panels.js";
 import { showTiles } from "./tiles.js";
 
 const $ = (id) => document.getElementById(id);
 // Without data for this time, the page says so.
 const QUIET_MS = 3000;
-let map, operation, source, heard = 0, end = null, played = null;
+const KINDS = { live: "good", late: "bad", stale: "bad" };
+let map, operation, player = null, source, heard = 0, end = null, played = null, positions = null;
 
 function show(kind, text) {
   const chip = $("state");
@@ -20,8 +21,16 @@ function judge() {
   const quiet = performance.now() - heard;
   if (end === "ended") show("", played ? "playback ended" : "recording ended");
   else if (end === "failed") show("bad", "display failed: see the terminal");
-  else if (heard && quiet < QUIET_MS) show(played?.is_paused ? "" : "good", played ? playing(played) : "live");
+  else if (heard && quiet < QUIET_MS && played) show(played.is_paused ? "" : "good", playing(played));
+  else if (heard && quiet < QUIET_MS) show(KINDS[positions?.state] ?? "", positions?.summary ?? "no frame is processed yet");
   else if (heard) show("bad", `no data for ${Math.round(quiet / 1000)} s`);
+}
+
+// Why positions are late or stale, and what helps.
+function showCause() {
+  const text = end ? "" : [positions?.cause, positions?.remedy].filter(Boolean).join(". ");
+  if ($("cause").textContent !== text) $("cause").textContent = text;
+  $("cause").hidden = !text;
 }
 
 const playing = ({ is_paused, rate }) => (is_paused ? "paused" : rate === 1 ? "playing" : `playing × ${rate}`);
@@ -45,6 +54,9 @@ function connect() {
   listen("status", (data) => {
     end = data.end;
     played = data.playback ?? null;
+    positions = data.positions ?? null;
+    showCause();
+    player?.show(end ? null : played);
     showStatus(data);
     operation.show(data);
     judge();
@@ -82,6 +94,7 @@ async function begin() {
   }
   map = new FloorMap($("floor"), $("legend"), $("growth"), $("view"), scene);
   operation = new Operation(scene.may_operate);
+  if (scene.may_play) player = new PlayerBar((state) => { played = state; player.show(state); judge(); });
   reconnect();
   setInterval(judge, 500);
 }

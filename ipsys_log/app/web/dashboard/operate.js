@@ -1,4 +1,5 @@
-// The buttons of the operator.
+// The buttons of the operator, and those of the player of a log.
+import { make } from "./make.js";
 import { Seat, post } from "./operator.js";
 
 const $ = (id) => document.getElementById(id);
@@ -64,5 +65,51 @@ export class Operation {
     $("notice").className = bad ? "bad" : "";
     $("notice").hidden = false;
     this.timer = setTimeout(() => ($("notice").hidden = true), NOTICE_MS);
+  }
+}
+
+const RATES = [0.1, 0.25, 0.5, 1, 2, 5, 10];
+
+export function duration(seconds) {
+  const whole = Math.floor(seconds), two = (value) => String(value).padStart(2, "0");
+  return `${Math.floor(whole / 3600)}:${two(Math.floor(whole / 60) % 60)}:${two(whole % 60)}`;
+}
+
+export class PlayerBar {
+  // changed(state): the server has carried out a command.
+  constructor(changed) {
+    this.changed = changed;
+    this.dragged = false;
+    $("play").addEventListener("click", () => this.send({ is_paused: !this.state.is_paused }));
+    $("rate").addEventListener("change", () => this.send({ rate: Number($("rate").value) }));
+    $("seek").addEventListener("input", () => { this.dragged = true; this.tell(Number($("seek").value)); });
+    $("seek").addEventListener("change", () => { this.dragged = false; this.send({ seconds: Number($("seek").value) }); });
+  }
+
+  async send(command) {
+    try { this.changed(await post("play", command)); } catch (error) { $("at").textContent = error.message; }
+  }
+
+  show(state) {
+    $("player").hidden = !state;
+    if (!state) return;
+    this.state = state;
+    const { is_paused, rate, seconds, of_seconds } = state;
+    if (![...$("rate").options].some((option) => Number(option.value) === rate)) {
+      const rates = [...new Set([...RATES, rate])].sort((a, b) => a - b);
+      $("rate").replaceChildren(...rates.map((value) => make("option", { value: String(value) }, `× ${value}`)));
+    }
+    if (document.activeElement !== $("rate")) $("rate").value = String(rate);
+    $("play").textContent = is_paused ? "Play" : "Pause";
+    $("seek").max = of_seconds;
+    if (this.dragged) return;
+    $("seek").value = seconds;
+    this.tell(seconds);
+  }
+
+  tell(seconds) {
+    const text = `${duration(seconds)} of ${duration(this.state.of_seconds)}`;
+    $("at").textContent = text;
+    $("seek").setAttribute("aria-valuetext", text);
   }
 }

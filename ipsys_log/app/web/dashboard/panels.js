@@ -2,13 +2,19 @@
 import { showCameras } from "./cameras_panel.js";
 import { count, fill, table } from "./tables.js";
 import { make } from "./make.js";
+import { duration } from "./operate.js";
 
 const $ = (id) => document.getElementById(id);
 const ROBOTS_MS = 250;
-let robotsShown = -Infinity;
+let robotsShown = -Infinity, later = null;
 
 export function showRobots(data) {
-  if (performance.now() - robotsShown < ROBOTS_MS) return;
+  const left = robotsShown + ROBOTS_MS - performance.now();
+  clearTimeout(later);
+  if (left > 0) {
+    later = setTimeout(() => showRobots(data), left);
+    return;
+  }
   robotsShown = performance.now();
   const rows = data.robots.filter((robot) => robot.colour).sort((a, b) => a.id - b.id).map((robot) => {
     const unseen = Math.max(data.now - robot.seen, 0);
@@ -38,11 +44,6 @@ function size(bytes) {
   let unit = 0;
   while (bytes >= 1000 && unit < UNITS.length - 1) { bytes /= 1000; unit += 1; }
   return `${unit ? bytes.toFixed(1) : bytes} ${UNITS[unit]}`;
-}
-
-function duration(seconds) {
-  const whole = Math.floor(seconds), two = (value) => String(value).padStart(2, "0");
-  return `${Math.floor(whole / 3600)}:${two(Math.floor(whole / 60) % 60)}:${two(whole % 60)}`;
 }
 
 function showPlayback({ file, seconds, of_seconds, rate, is_paused, loops }) {

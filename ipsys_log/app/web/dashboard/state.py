@@ -6,6 +6,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from ipsys_log.app.web.dashboard.status import (
 )
 from ipsys_log.capture.frames import CameraState
 from ipsys_log.capture.live_check import FrameCheck
+from ipsys_log.errors import IpsysError
 from ipsys_log.live_runs.player import Player
 from ipsys_log.log.contents import run_of_topic
 from ipsys_log.messages import (
@@ -42,11 +44,14 @@ from ipsys_log.sinks.selection import PlayedScene
 from ipsys_log.sinks.streams.opening import Stream
 from ipsys_log.sinks.streams.poses import NewSession
 from ipsys_log.statistics.disagreement import OverlapSummary
+from ipsys_log.statistics.latency import PositionMonitor
 from ipsys_log.units import NS_PER_S
 
 _NS_PER_MS = 1_000_000
 # Number of the last positions whose latencies count.
 _LATENCIES = 1000
+# After a seek in a pause, the page shows what came in this time: an image of each camera of 4 Hz or more.
+_LEAD_S = 0.5
 # Events that end and begin the state `up` of a camera.
 _UP_AFTER = {"camera_lost": False, "camera_back": True}
 
@@ -64,6 +69,7 @@ class DashboardSetting:
     now_ns : the clock of the log times.
     streams : the streams of positions.
     played : the playback of the log; None for a recording.
+    positions : the state of the positions of a recording.
     """
 
     rig: Rig | None
@@ -76,6 +82,7 @@ class DashboardSetting:
     now_ns: Callable[[], int]
     streams: Sequence[Stream] = ()
     played: PlayedLog | None = None
+    positions: PositionMonitor | None = None
 
 
 class Dashboard:
@@ -135,7 +142,14 @@ class Dashboard:
                 "trails": self._robots.trails(),
                 "may_operate": may_operate and self.operator is not None,
                 "played": self._setting.played is not None,
+                "may_play": may_operate and self._setting.played is not None,
             }
+
+    def control(self, body: Mapping[str, Any]) -> dict[str, Any]:
+        """Change the playback of the log as :meth:`PlayedLog.control`; a recording has none."""
+        if self._setting.played is None:
+            raise IpsysError("this page shows a recording; only the playback of a log can pause or move")
+        return self._setting.played.control(body)
 
     def robots(self) -> dict[str, Any]:
         """Return the newest poses; ``now`` is the time of the page in ms. A new session has new trails."""
@@ -166,6 +180,7 @@ class Dashboard:
             "streams": describe_streams(self._setting.streams),
             **self._statistics(now_ns),
             "events": events,
+            **self._describe_positions(),
             **self._operation(now_ns),
         }
 
@@ -214,12 +229,20 @@ class Dashboard:
             return {"playback": played.describe()}
         return {"recording": describe_recording(self._setting.log, now_ns - self._begin_ns)}
 
+    def _describe_positions(self) -> dict[str, Any]:
+        """Return whether the positions are live, late or stale; nothing before the first frame."""
+        state = self._setting.positions and self._setting.positions.state
+        return {"positions": {**state._asdict(), "summary": state.summary}} if state else {}
+
     def _statistics(self, now_ns: int) -> dict[str, Any]:
         """Return latencies and disagreement of cameras, computed at most once per second."""
-        if self._computed is None or now_ns - self._computed[0] >= NS_PER_S:
+        before_ns = None if self._computed is None else self._computed[0]
+        # In a pause of a playback, the clock stands still.
+        if before_ns is None or now_ns == before_ns or now_ns - before_ns >= NS_PER_S:
             with self._lock:
                 latencies, overlap = list(self._latencies), self._overlap.lines()
             self._computed = now_ns, {"latency": describe_latencies(latencies), "overlap": overlap}
+        assert self._computed is not None
         return self._computed[1]
 
     def _operation(self, now_ns: int) -> dict[str, Any]:
@@ -278,6 +301,27 @@ class PlayedLog:
             "is_paused": player.is_paused,
             "loops": player.loop,
         }
+
+    def control(self, body: Mapping[str, Any]) -> dict[str, Any]:
+        """Pause or continue, move to a time, or change the rate; return the new state of the playback.
+
+        Raises
+        ------
+        IpsysError
+            A value is not a number, or the rate is outside its range.
+        """
+        player, numbers = self._player, {}
+        for name in body.keys() & {"seconds", "rate"}:
+            if type(body[name]) not in (int, float) or not isfinite(body[name]):
+                raise IpsysError(f"{name}: give a number")
+            numbers[name] = float(body[name])
+        if "rate" in numbers:
+            player.rate = numbers["rate"]
+        if "is_paused" in body:
+            (player.pause if body["is_paused"] is True else player.resume)()
+        if "seconds" in numbers:
+            player.seek(numbers["seconds"], _LEAD_S)
+        return self.describe()
 
     def picture_every_ns(self) -> int:
         """Return the shortest time between two pictures: each one in a pause, else five in a real second."""

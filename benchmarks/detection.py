@@ -38,6 +38,9 @@ _KEPT = ", heap kept"
 _SEVERAL = "3 cameras at once"
 _TAGS = "3 AprilTags (36h11)"
 _RESTARTS = "3 markers, restarts"
+_TEXTURED = "3 markers, textured"
+_TEXTURED_TAGS = "3 AprilTags, textured"
+_FIRST = ("plain", "stateless", "reset", "tracking")
 _MARKERS = (3, 1, 8)
 
 
@@ -64,6 +67,9 @@ def _scenes(lab: Mapping[str, Any], report: Report) -> list[Scene]:
     ]
     three = scenes[0] = replace(scenes[0], finders=(*ours, "plain" + _KEPT, "tracking" + _KEPT))
     scenes.append(Scene(_SEVERAL, three.path, three.settings, ("plain3", "ours3"), together=True))
+    for name, dictionary in ((_TEXTURED, "DICT_4X4_100"), (_TEXTURED_TAGS, "DICT_APRILTAG_36h11")):
+        textured = LabSettings(**lab, textured=True, dictionary=dictionary)
+        scenes.append(Scene(name, drawn(textured), textured, _FIRST))
     restarts = with_restarts(three.path)
     if restarts is None:
         report.remarks.append("no restart markers: install jpegtran (Debian: libjpeg-turbo-progs)")
@@ -168,6 +174,11 @@ def measure(options: argparse.Namespace) -> Report:
     add("3 markers", "plain", "tracking", (">=", 4.5), "plain / tracking")
     add("3 markers", "tracking", "decode", ("<=", 1.3), "tracking / decode only")
     add("3 markers", "plain", "stateless", (">=", 3.5), "plain / stateless")
+    add(_TEXTURED, "plain", "stateless", (">=", 3.0), "plain / stateless, textured floor")
+    add(_TEXTURED, "plain", "reset", None, "plain / after a reset, textured floor")
+    add(_TEXTURED_TAGS, "plain", "stateless", (">=", 2.0), "plain / stateless, textured floor, 36h11")
+    add(_TEXTURED_TAGS, "plain", "reset", None, "plain / after a reset, textured floor, 36h11")
+    add(_TEXTURED, "plain", "tracking", None, "plain / tracking, textured floor")
     add(_SEVERAL, "plain3", "ours3", (">=", 6.0), "plain / ours, 3 cameras at once")
     add(_RESTARTS, "plain", "tracking", (">=", 7.0), "plain / tracking, restart markers")
     add(_TAGS, "apriltags", "tracking", None, "apriltags / tracking, 36h11")

@@ -16,8 +16,10 @@ from rounds import Turn
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Markers, Message, Rig
 from ipsys_log.messages.channels import CALIBRATIONS, RIG
+from ipsys_log.messages.stage import Resets
 from ipsys_log.stages import detect
 from ipsys_log.stages.detect import Detect
+from ipsys_log.units import NS_PER_S
 
 __all__ = ["FINDERS", "OURS", "Found", "one_by_one", "threaded"]
 
@@ -80,16 +82,23 @@ def _dictionary(rig: Rig) -> cv2.aruco.Dictionary:
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, rig.dictionary))
 
 
-def stateless(rig: Message, lenses: dict[str, Message], corners: str = OURS) -> Finder:
+def stateless(
+    rig: Message, lenses: dict[str, Message], corners: str = OURS, resets: Resets | None = None
+) -> Finder:
     """Return the ipsys finder without memory: a new stage for every frame."""
 
     def find(message: Message) -> list[tuple[int, Corners]]:
-        stage = Detect(corners)
+        stage = Detect(corners, resets)
         _fed(stage, rig)
         _fed(stage, lenses[str(message.camera)])
         return _fed(stage, message)
 
     return find
+
+
+def reset(rig: Message, lenses: dict[str, Message]) -> Finder:
+    """Return the ipsys finder with each frame as the first one after a reset."""
+    return stateless(rig, lenses, OURS, Resets(NS_PER_S))
 
 
 def tracking(rig: Message, lenses: dict[str, Message]) -> Finder:
@@ -144,6 +153,7 @@ FINDERS: dict[str, Callable[[Message, dict[str, Message]], Finder]] = {
     "plain": plain,
     "stock": stock,
     "stateless": stateless,
+    "reset": reset,
     "tracking": tracking,
     "decode": decode,
     "read": read,

@@ -21,8 +21,9 @@ import numpy as np
 from ipsys_log.errors import FrameError
 from ipsys_log.messages import CAMERA_MOVED, Array, CompressedImage, CompressedVideo, Markers, Message, Rig
 from ipsys_log.messages.events import MODEL_CONTRADICTED
+from ipsys_log.stages.detect.cells import count_wrong_cells
 from ipsys_log.stages.detect.misprints import find_misprints
-from ipsys_log.stages.detect.search import count_wrong_cells, search_squares
+from ipsys_log.stages.detect.search import search_squares
 from ipsys_log.statistics.disagreement import Difference, OverlapStream
 from ipsys_log.units import CM_PER_M, MM_PER_M, NS_PER_S
 from ipsys_log.vision.decode import decode_grey

@@ -27,6 +27,7 @@ from ipsys_log.messages.channels import (
 from ipsys_log.messages.stage import Plan, Stage
 from ipsys_log.models.table import model_run, needs_height
 from ipsys_log.stages.detect import usual_corners
+from ipsys_log.statistics.model_kinds import model_kind
 
 
 class LivePlan(NamedTuple):
@@ -149,6 +150,8 @@ def check_start(
     _check(rig, cameras, lenses, models, until)
     if not models:
         return []
+    for model in models:
+        model_kind(model.name).step(model)  # loads its libraries: no frame must wait for them
     assert request.model_from is not None
     return compare_labs(request.model_from, rig, lenses) + [
         f"camera {name}: {request.model_from} has no model of this camera; it is recorded, but not used "

@@ -151,7 +151,9 @@ def parse_source(camera: RigCamera) -> SimulatedCamera:
     requested = {"width": camera.width, "height": camera.height, "rate_hz": camera.rate_hz}
     values: dict[str, int | float] = {key: value for key, value in requested.items() if value is not None}
     setting_types = {
-        f.name: type(f.default) for f in fields(LabSettings) if isinstance(f.default, (int, float))
+        f.name: _parse_switch if isinstance(f.default, bool) else type(f.default)
+        for f in fields(LabSettings)
+        if isinstance(f.default, (int, float))
     }
     board = None
     for key, text in parse_qsl(query, keep_blank_values=True):
@@ -168,6 +170,8 @@ def parse_source(camera: RigCamera) -> SimulatedCamera:
         except ValueError as error:
             raise IpsysError(
                 f"camera {camera.name}: {key}={text} is not a number; write {key}=1, for example"
+                if setting_types[key] is not _parse_switch
+                else f"camera {camera.name}: {key}={text} is no switch; write {key}=true or {key}=false"
             ) from error
     settings = replace(LIVE_SETTINGS, **values)  # type: ignore[arg-type]
     if name not in settings.cameras:
@@ -176,6 +180,10 @@ def parse_source(camera: RigCamera) -> SimulatedCamera:
             f"camera {camera.name}: the simulated lab has no camera {name!r}; write one of {names}"
         )
     return SimulatedCamera(settings, settings.cameras.index(name), board)
+
+
+def _parse_switch(text: str) -> bool:
+    return bool(("false", "true").index(text))
 
 
 def _parse_board(camera: RigCamera, text: str) -> Board:

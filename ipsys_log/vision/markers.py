@@ -237,8 +237,8 @@ class PlacedBoard:
     world_from_marker: Array
 
 
-# A function from the time in s since the time of the frame to the marker at that time.
-MovingMarker = Callable[[float], PlacedMarker]
+# A function from the time in s since the time of the frame to the print at that time.
+MovingMarker = Callable[[float], PlacedMarker | PlacedBoard]
 
 
 @cache

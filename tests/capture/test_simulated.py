@@ -181,6 +181,7 @@ def test_board_before_a_camera_gives_its_lens(text: str, tmp_path: Path) -> None
         ("sim:green", "has no camera 'green'; write one of sim:red, sim:white, sim:black"),
         ("sim:red?colour=3", "has no setting 'colour'"),
         ("sim:red?seed=three", "seed=three is not a number"),
+        ("sim:red?textured=1", "textured=1 is no switch"),
         ("sim:red?markers=0", "simulator setting markers is 0"),
         (
             "sim:red?board=6",

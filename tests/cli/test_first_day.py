@@ -233,7 +233,8 @@ def test_figure_without_a_valid_suffix_is_refused_first(
     ipsys: Ipsys, lab: Path, arguments: tuple[str, ...]
 ) -> None:
     before = lab.read_bytes()
-    for name in ("floor.doc", "floor"):
+    # With several figures, a name without a suffix is a folder.
+    for name in ("floor.doc",) if arguments == ("replay",) else ("floor.doc", "floor"):
         done = ipsys(*arguments, lab, "--plot", lab.parent / name)
         assert done.code == 1
         assert "is not a figure file; use a name that ends in .png, .pdf, .svg" in done.err

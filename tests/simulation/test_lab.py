@@ -2,6 +2,7 @@
 
 import hashlib
 from collections import Counter
+from dataclasses import replace
 from itertools import pairwise
 
 import cv2
@@ -23,6 +24,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.log.codec import encode
 from ipsys_log.messages import CameraCalibration, CompressedImage, Measurement, Message, Rig, Tracks
 from ipsys_log.messages.rig_file import check_rig
+from ipsys_log.vision.decode import decode_grey
 from ipsys_log.vision.markers import PlacedMarker, project_corners
 from ipsys_log.vision.trilateration import trilaterate
 
@@ -48,6 +50,19 @@ def test_a_seed_gives_the_same_bytes_and_another_seed_others(session: list[Messa
     other = LabSettings(seed=1, width=640, height=360, stations=4, frames_per_station=2)
     others = (m for m in simulate(other) if isinstance(m.payload, CompressedImage))
     assert next(others).payload.data != first.payload.data
+
+
+def test_textured_floor_has_a_seed_and_moving_feet() -> None:
+    lab = replace(SMALL, textured=True, stations=0, markers=1, cameras=("white",), rate_hz=2.0, drive_s=1.0)
+    frames = [
+        [m.payload for m in simulate(settings) if isinstance(m.payload, CompressedImage)]
+        for settings in (lab, lab, replace(lab, seed=1))
+    ]
+    assert [frame.data for frame in frames[0]] == [frame.data for frame in frames[1]]
+    first, later, other = map(decode_grey, (*frames[0], frames[2][0]))
+    # Feet and the robot cover a small part of the image; another seed gives another floor.
+    assert 0.002 < np.mean(cv2.absdiff(first, later) > 40) < 0.05
+    assert np.mean(cv2.absdiff(first, other) > 40) > 0.05
 
 
 def test_messages_come_in_log_order_with_their_own_times(session: list[Message]) -> None:

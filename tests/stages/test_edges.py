@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -17,11 +18,13 @@ from ipsys_log.capture.simulation.drive import plan_drive
 from ipsys_log.capture.simulation.lab import EPOCH_NS, simulate, start_of_set_ns
 from ipsys_log.capture.simulation.render import encode_jpeg, render
 from ipsys_log.capture.simulation.settings import LabSettings
+from ipsys_log.capture.simulation.textured_floor import feet
 from ipsys_log.messages import CameraCalibration, CompressedImage, Marker, RigCamera, Tracks
 from ipsys_log.stages.detect.adjustment import Guess
 from ipsys_log.stages.detect.edges import fit_edges
 from ipsys_log.stages.detect.follow import MarkerTracker
 from ipsys_log.units import NS_PER_S
+from ipsys_log.vision.decode import decode_grey
 from ipsys_log.vision.markers import project_corners
 from tests.stages.drawing import (
     FISHEYE,
@@ -103,6 +106,33 @@ def test_a_gamma_does_not_move_corners(starts_s: Sequence[float]) -> None:
     check(score, 0.07, 0.5, 0.995)
     assert np.mean(score.edge_offsets_px) == pytest.approx(0.42, abs=0.05)
     assert np.std(score.edge_offsets_px) < 0.05
+
+
+@pytest.mark.parametrize("dictionary", ["DICT_4X4_100", "DICT_APRILTAG_36h11"])
+def test_textured_floor_loses_no_marker(dictionary: str) -> None:
+    """Small markers between clutter: a first frame shows those that OpenCV detects, and no other ids."""
+    lab = replace(LAB, textured=True, markers=12, marker_length_m=0.05, dictionary=dictionary)
+    camera, score = CAMERAS["white"], Score()
+    drive, floor = plan_drive(lab, list(CAMERAS.values())), prepare_view(camera, lab)
+    detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary)))
+    for time_s in (1.0, 4.0, 9.0):
+        places = drive.poses_at(time_s)
+        prints = [place_marker(one, lab) for one in places]
+        data = encode_jpeg(render(floor, [*feet(lab, time_s), *prints], lab, None), lab)
+        truth_px = {p.id: project_corners(camera.lens, camera.camera_from_world, p) for p in prints}
+        image = CompressedImage(1, camera.name, data, "jpeg")
+        px, ids, _ = detector.detectMarkers(decode_grey(image))
+        numbers = [int(n) for n in np.ravel(ids)]
+        stock = [
+            n
+            for n, corners in zip(numbers, px, strict=True)
+            if n in truth_px and np.abs(corners[0] - truth_px[n]).max() < 10
+        ]
+        track = MarkerTracker(dictionary, camera.lens, None, 0.0, ids=frozenset(truth_px))
+        fits, _, _ = track(image, 1)
+        score.add([Marker(fit.pose.id, fit.corners_px) for fit in fits], truth_px, stock)
+    assert len(score.offs_px) > 8
+    check(score, 0.15, 0.5, 1.0)
 
 
 ROLLING = LabSettings(

@@ -152,15 +152,13 @@ def test_random_squares_are_no_prints_of_a_dictionary() -> None:
     """One of 16 random squares with 4x4 cells is an id of DICT_4X4_1000."""
     rng = np.random.default_rng(0)
     pages = [random_page(rng, cells) for cells in (4, 5, 6) for _ in range(25)]
-    assert [
-        page for page in pages if find_misprints(page, RIG_50, find_squares(page, RIG_50)) is not None
-    ] == []
+    assert [page for page in pages if find_misprints(page, RIG_50, find_squares(page)) is not None] == []
 
 
 def test_prints_of_another_dictionary_among_random_squares_are_named() -> None:
     page = random_page(np.random.default_rng(1), 4)
     page[240:] = lab(3, 7, 20, 30, 31, 32, dictionary="DICT_5X5_50", cells=7)[240:]
-    misprints = find_misprints(page, RIG_50, find_squares(page, RIG_50))
+    misprints = find_misprints(page, RIG_50, find_squares(page))
     assert misprints is not None
     assert 'dictionary = "DICT_5X5_50"' in misprints.advice
 
@@ -197,7 +195,7 @@ def test_squares_without_a_pattern_are_no_prints() -> None:
         x, y, side = rng.integers(0, 560), rng.integers(0, 420), rng.integers(20, 80)
         boxes[y : y + side, x : x + side] = rng.integers(0, 255)
     for picture in [*pictures, boxes]:
-        assert find_misprints(picture, RIG_50, find_squares(picture, RIG_50)) is None
+        assert find_misprints(picture, RIG_50, find_squares(picture)) is None
     assert events(payloads(pictures)) == []
 
 

@@ -15,7 +15,7 @@ from ipsys_log.capture.simulation.drive import plan_drive
 from ipsys_log.capture.simulation.render import encode_jpeg, render
 from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.messages import CompressedImage, Event, Marker
-from ipsys_log.stages.detect import Detect
+from ipsys_log.stages.detect import Detect, search
 from ipsys_log.stages.detect.adjustment import Guess, MarkerFit
 from ipsys_log.stages.detect.partial import fit_visible_edges
 from ipsys_log.stages.detect.search import detect_markers
@@ -69,6 +69,15 @@ def test_edges_in_uneven_light_find_as_many_as_stock(name: str) -> None:
     if score.offs_px:
         # Cells are smaller here than at full size, and markers few.
         assert score.rms_px <= 2 * LIGHTS[name].rms_px, score
+
+
+def test_rest_of_a_large_image_is_searched_in_the_next_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+    data, truth_px = lit_frame(VGA, LIGHTS["shadow of 35 %"].light, 0, length_m=SIDE_M, count=2)
+    frames = [(time_ns, data) for time_ns in each_time(4)]
+    assert [len(markers) for markers in follow(VGA, frames)] == [len(truth_px)] * 4
+    monkeypatch.setattr(search, "_MOST_PX", 1)
+    counts = [len(markers) for markers in follow(VGA, frames)]
+    assert counts[0] < counts[-1] == len(truth_px)
 
 
 @cache

@@ -91,8 +91,8 @@ stages in their order; smooth only runs with --until smooth:
 
 Examples
 
-    ipsys replay calibration.mcap                      # fit and evaluate the best model
-    ipsys replay calibration.mcap --model poly --plot floor.png    # the method of the paper
+    ipsys replay calibration.mcap                      # fits the best model
+    ipsys replay calibration.mcap --model poly --plot floor.png
     ipsys replay monday.mcap --model-from calibration.mcap
     ipsys replay calibration.mcap --rig lab.toml       # with a corrected rig
     ipsys replay monday.mcap --until detect            # only the markers

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.capture.simulation.settings import FLOOR_M, HALL_SPACING_M, LabSettings, Purpose, random_stream
+from ipsys_log.capture.simulation.textured_floor import read_map
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Array, CameraCalibration
 from ipsys_log.vision.lenses import project, undistort
@@ -242,6 +243,8 @@ def _lay_rows(settings: LabSettings, camera: Camera, rays: Array) -> Plane:
     on_boards = (across >= 0) & (across <= columns) & (along >= 0) & (along <= rows)
     boards = _boards(settings, x_m, y_m) * _seams(across, along, pixel_m)
     concrete = 0.62 * settings.floor + 4.0 * _noise_at(settings, 1, x_m, y_m, 1.0)
+    if settings.textured:
+        boards = concrete = read_map(settings, x_m, y_m) + boards - settings.floor
     # The lamps are above the middle of the floor; a hall has more of them.
     shares = np.array(settings.floor_m) / FLOOR_M
     bright_m, fading = (2.2, 2.8) * shares, 0.012 / shares.max() ** 2

@@ -19,6 +19,7 @@ from ipsys_log.capture.simulation.cameras import Camera, FloorView, mount_camera
 from ipsys_log.capture.simulation.drive import Drive, plan_drive
 from ipsys_log.capture.simulation.render import encode_jpeg, exposure_interval, render
 from ipsys_log.capture.simulation.settings import LabSettings, Purpose, random_stream
+from ipsys_log.capture.simulation.textured_floor import feet
 from ipsys_log.messages import (
     MEASUREMENTS_TOPIC,
     RIG_TOPIC,
@@ -157,7 +158,8 @@ def _photograph(
 ) -> CompressedImage:
     """Render the frame of a camera at an instant; it does not depend on the threads."""
     rng = random_stream(settings.seed, Purpose.FRAME, number, index)
-    data = encode_jpeg(render(view, instant.prints, settings, rng), settings)
+    prints = (*feet(settings, (instant.time_ns - EPOCH_NS) / NS_PER_S), *instant.prints)
+    data = encode_jpeg(render(view, prints, settings, rng), settings)
     return CompressedImage(instant.time_ns, view.camera.name, data, "jpeg")
 
 

@@ -26,6 +26,7 @@ from ipsys_log.capture.simulation.drive import Drive, eased_s, plan_drive
 from ipsys_log.capture.simulation.lab import build_rig, live_cameras, moving_marker
 from ipsys_log.capture.simulation.render import Print, add_static_prints, encode_jpeg, render
 from ipsys_log.capture.simulation.settings import LabSettings, Purpose, random_stream
+from ipsys_log.capture.simulation.textured_floor import feet
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Array, Rig, RigMarker
 from ipsys_log.messages.rig_checks import dictionary_size
@@ -364,7 +365,8 @@ def next_missing(film: Film, drawn: Container[int], frame: int) -> int | None:
 
 def _moving_marker(lab: LiveLab, index: int) -> list[Print]:
     time_s = lab.time_of(index)
-    return [moving_marker(lab.drive, marker_id, time_s, lab.settings) for marker_id in lab.drive.ahead_s]
+    markers = [moving_marker(lab.drive, marker_id, time_s, lab.settings) for marker_id in lab.drive.ahead_s]
+    return [*feet(lab.settings, time_s), *markers]
 
 
 def _picture(view: FloorView, prints: list[Print], settings: LabSettings, number: int, index: int) -> bytes:

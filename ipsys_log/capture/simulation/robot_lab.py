@@ -14,6 +14,7 @@ from ipsys_log.capture.simulation.cameras import FloorView, mount_cameras, prepa
 from ipsys_log.capture.simulation.lab import build_rig, live_cameras, true_tracks
 from ipsys_log.capture.simulation.render import add_static_prints, encode_jpeg, render
 from ipsys_log.capture.simulation.settings import LabSettings, Purpose, random_stream
+from ipsys_log.capture.simulation.textured_floor import feet
 from ipsys_log.messages import Rig, Tracks, Waypoint
 from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.markers import MovingMarker, PlacedBoard
@@ -224,7 +225,8 @@ class RobotLab:
     def draw(self, number: int, frame: int, time_ns: int) -> bytes:
         """Return the JPEG of a camera for a frame; the robots must have moved to the end of its exposure."""
         rng = random_stream(self._seed, Purpose.FRAME, number, frame)
-        prints = [self._print_of(name, time_ns) for name in self._drives]
+        markers = [self._print_of(name, time_ns) for name in self._drives]
+        prints = [*feet(self.settings, time_ns / NS_PER_S), *markers]
         return encode_jpeg(render(self._views[number], prints, self.settings, rng), self.settings)
 
     def _print_of(self, name: str, time_ns: int) -> MovingMarker:

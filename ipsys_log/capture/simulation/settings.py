@@ -48,6 +48,8 @@ class Purpose(IntEnum):
     RELAY = 19
     WEEKS = 20
     TOPS = 21
+    CLUTTER = 22
+    FEET = 23
 
 
 def random_stream(seed: int, purpose: Purpose, *which: int) -> np.random.Generator:
@@ -118,6 +120,7 @@ class LabSettings:
     tape_sigma_m, ruler_sigma_m : sigma of a measured distance, and of a measured height.
     tape_angle_deg : least angle between the two tapes at a calibration point.
     top_tilt_deg : largest tilt of a marker on its robot. Each marker has its own constant tilt up to this.
+    textured : the floor has tiles, planks, tape, cables, clutter and shadows, and people walk on it.
 
     Raises
     ------
@@ -155,6 +158,7 @@ class LabSettings:
     ruler_sigma_m: float = 0.001
     tape_angle_deg: float = 15.0
     top_tilt_deg: float = 0.0
+    textured: bool = False
 
     def __post_init__(self) -> None:
         for name, (low, high) in _RANGES.items():

@@ -197,6 +197,7 @@ class FrameDetector:
         return MarkerTracker(
             *(rig.dictionary, lens, camera.edge_offset_px, row_time_s, number, message.camera),
             is_thorough=self._resets is not None,
+            ids=frozenset(marker.id for marker in rig.all_markers) if rig.markers else None,
         )
 
     def _new_lens(self, message: Message) -> Iterator[LensInUse]:
@@ -386,7 +387,7 @@ def _rig_part(rig: Rig, _method: str) -> object:
 
 STAGE = Stage(
     name="detect",
-    versions={"detect": 3, EDGES: 2, STOCK: 2},
+    versions={"detect": 3, EDGES: 3, STOCK: 2},
     reads=(RIG, CALIBRATIONS, IMAGES, EVENTS, MARKERS),
     writes=(MARKERS, ANNOTATIONS, RUN_EVENTS),
     plan=_plan,

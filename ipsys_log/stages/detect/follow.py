@@ -6,18 +6,22 @@ import numpy as np
 
 from ipsys_log.messages import Array, CameraCalibration, CompressedImage, Grey, RawImage
 from ipsys_log.stages.detect.adjustment import Guess, MarkerFit
+from ipsys_log.stages.detect.cells import Candidate
 from ipsys_log.stages.detect.edges import fit_edges
 from ipsys_log.stages.detect.misprints import Inspection, Misprints
 from ipsys_log.stages.detect.motion import LONG_S, ChangeDetector, Track, extend, predict, same_speed
 from ipsys_log.stages.detect.partial import Rejection, fit_visible_edges, resembles
 from ipsys_log.stages.detect.search import (
     WHOLE,
-    Candidate,
+    Area,
+    Ids,
+    find_unexplained_areas,
     sample,
     search,
     search_squares,
     search_thoroughly,
-    search_unexplained_areas,
+    split,
+    take,
 )
 from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.decode import decode_rows
@@ -64,6 +68,7 @@ class MarkerTracker:
     camera : its name, for messages.
     is_thorough : search the first frame thoroughly, too. After a reset, no earlier frame shows the markers
         that only this search finds.
+    ids : the ids in use. Markers of other ids are only detected if their cells are clear. None: all ids.
     """
 
     def __init__(
@@ -75,9 +80,10 @@ class MarkerTracker:
         number: int = 0,
         camera: str | None = None,
         is_thorough: bool = False,
+        ids: Ids = None,
     ) -> None:
         self._dictionary = dictionary
-        self._is_thorough = is_thorough
+        self._is_thorough, self._ids = is_thorough, ids
         self._lens, self._camera = lens, camera
         self._edge_offset_px = edge_offset_px
         self._row_time_s = row_time_s
@@ -91,6 +97,8 @@ class MarkerTracker:
         self._rejections: list[Rejection] = []
         self._candidates: list[Candidate] = []
         self._inspect = Inspection()
+        # The areas that the next frames search thoroughly.
+        self._areas: list[Area] = []
         # The prints in the last frame that are no markers of the rig, if it was inspected.
         self.misprints: Misprints | None = None
 
@@ -133,7 +141,8 @@ class MarkerTracker:
         due = turn % _SEARCH_EVERY == 0 or fresh
         thorough = turn % _THOROUGH_EVERY == _SEARCH_EVERY or (self._is_thorough and self._last_ns is None)
         self._rejections, self._candidates = [], []
-        grey, rows, seen, lost = self._look_again(frame, time_ns, due or turn % _WHOLE_EVERY == 0)
+        whole = due or turn % _WHOLE_EVERY == 0 or bool(self._areas)
+        grey, rows, seen, lost = self._look_again(frame, time_ns, whole)
         # A frame that cannot be decoded raises an error before this line: the next frame takes its turn.
         self._frames, self._last_ns = turn + 1, time_ns
         fits = list(seen.values())
@@ -144,20 +153,25 @@ class MarkerTracker:
         samples, squares_px = sample(grey) if fresh else None, None
         if region is not None:
             if region is WHOLE:
-                candidates, squares_px = search_squares(grey, self._dictionary, samples)
+                candidates, squares_px = search_squares(grey, self._dictionary, samples, self._ids)
             else:
-                candidates = search(grey, self._dictionary, region)
+                candidates = search(grey, self._dictionary, region, self._ids)
             fits = self._add(grey, fits, candidates)
+        mask, better = None, 1.0
         if samples is not None:
             # No marker is known yet, and later frames may not show the markers that are missed now.
             known_px = [fit.corners_px for fit in fits]
-            leftovers = search_unexplained_areas(grey, self._dictionary, samples, known_px)
-            fits = self._add(grey, fits, leftovers, _MUCH_BETTER)
-        if thorough or lost - {fit.pose.id for fit in fits}:
-            fits = self._add(grey, fits, search_thoroughly(grey, self._dictionary))
+            self._areas, mask = find_unexplained_areas(grey, samples, known_px, is_whole=thorough)
+            better = _MUCH_BETTER
+        elif thorough or lost - {fit.pose.id for fit in fits}:
+            self._areas += [area for area in split(grey.shape) if area not in self._areas]
         elif turn % _SEARCH_EVERY == _SEARCH_EVERY // 2 and self._changed and len(fits) == len(seen):
             # A new object without a detected marker may be a marker in shadow.
-            fits = self._add(grey, fits, search_thoroughly(grey, self._dictionary, self._changed))
+            self._areas += split(grey.shape, self._changed)
+        candidates = []
+        for area in take(self._areas):
+            candidates += search_thoroughly(grey, self._dictionary, area, self._ids, mask, is_faint=thorough)
+        fits = self._add(grey, fits, candidates, better)
         self.misprints = None
         if due or self._rejections:
             known_px, is_odd = [fit.corners_px for fit in fits], bool(self._rejections)
@@ -238,6 +252,8 @@ class MarkerTracker:
         for n, (poses, fit) in enumerate(zip(guesses, fits, strict=True)):
             if fit is not None and not fit.disturbed:
                 continue
+            if self._ids is not None and poses[0].id not in self._ids:
+                continue  # no position is computed from it
             if not all(_inside(outline_px, grey) for outline_px in self._outlines(poses)):
                 continue
             if fit is None and not resembles(grey, self._lens, self._dictionary, poses):

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from ipsys_log.messages import Array, Grey
 from ipsys_log.messages.events import MIRRORED, OTHER_PRINTS
-from ipsys_log.stages.detect.search import find_squares, read_cells
+from ipsys_log.stages.detect.cells import read_cells
+from ipsys_log.stages.detect.search import find_squares
 
 Bits = NDArray[np.uint8]
 
@@ -85,7 +86,7 @@ class Inspection:
         if images & (images - 1):
             return None
         if squares_px is None:
-            squares_px = find_squares(grey, dictionary)
+            squares_px = find_squares(grey)
         unexplained_px = _unexplained(squares_px, markers_px)
         return find_misprints(grey, dictionary, unexplained_px, has_markers=bool(markers_px))
 
@@ -97,7 +98,7 @@ def find_misprints(
     found = [one for one in _explain(grey, squares_px, dictionary) if one.is_certain]
     if not found and not has_markers:
         inverse, size = 255 - grey, _size(dictionary)
-        prints = _clear_prints(inverse, find_squares(inverse, dictionary), size, 1)
+        prints = _clear_prints(inverse, find_squares(inverse), size, 1)
         negative = _Explanation.of(_NEGATIVE, dictionary, prints, _words(dictionary), _patterns(prints))
         found = [negative] if negative.is_certain else []
     if not found:

@@ -28,6 +28,7 @@ from ipsys_log.stages.detect.adjustment import (
     sample_cells,
     solve,
 )
+from ipsys_log.stages.detect.cells import count_wrong_cells
 from ipsys_log.stages.detect.prints import (
     EdgePositions,
     MarkerView,
@@ -37,7 +38,6 @@ from ipsys_log.stages.detect.prints import (
     locate,
     read_profiles,
 )
-from ipsys_log.stages.detect.search import count_wrong_cells
 from ipsys_log.stages.detect.uneven_light import (
     TAPS,
     Steps,

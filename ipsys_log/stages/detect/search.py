@@ -1,13 +1,13 @@
-"""Search for markers in a whole image: by squares in a reduced image, or as in the paper, by OpenCV alone.
+"""Search for markers in a whole image: by squares at three scales, or as in the paper, by OpenCV alone.
 
-OpenCV's detector finds squares at a third of the size, with one threshold window instead of three. There,
-the cells of a far or foreshortened marker are too small for identification. All squares that are not
-identified as markers are therefore read again at full size.
+The first search finds squares at a third of the size. There, the cells of a far or foreshortened marker are
+too small, and a shadow or blur hides an outline. The thorough search finds squares at half and at full size,
+with other thresholds. All squares are read at full size.
 """
 
-from collections.abc import Iterable, Sequence
-from functools import cache
-from typing import Any, NamedTuple
+import math
+from collections.abc import Sequence
+from itertools import accumulate
 
 import cv2
 import numpy as np
@@ -15,50 +15,62 @@ from numpy.typing import NDArray
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Array, Grey, Marker
-from ipsys_log.stages.detect.uneven_light import CELL_SAMPLES, count_contradictions
-from ipsys_log.vision.decode import levels_at
+from ipsys_log.stages.detect.cells import (
+    Candidate,
+    Threshold,
+    count_wrong_cells,
+    find_quads,
+    may_be_markers,
+    read_cells,
+    read_markers,
+)
 from ipsys_log.vision.markers import white_cells
 
+Ids = frozenset[int] | None
+Area = tuple[slice, slice]
+
 _SHRINK = 3
-# Window of the threshold at that scale. It is wider than the black border of a marker.
-_WINDOW_PX = 31
-_DARKER = 12
-_ROUNDED = 0.06
-_BORDER_PX = 1
+# At a third of the size, the window is wider than the black border of a marker, and the shortest outline is
+# that of OpenCV, a share of the longer side of the image.
+_QUICK = Threshold(31, 12, 0.06, 0.0)
+_SHORTEST = 0.03
+# Scales of the thorough search. Blur and faint light need the wide window at half size, small cells the
+# narrow one at full size (test_textured_floor_loses_no_marker).
+_THOROUGH = ((2, Threshold(13, 7, 0.05, 30.0)), (1, Threshold(9, 7, 0.05, 40.0)))
 _NEAR = (4, 4)
+# The wide window corrects corners in glare, but does not fit into the cells of a small marker.
+_WINDOWS = ((2, 2), _NEAR)
 _REFINE = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 10, 0.05)
-_MISREAD = 3
 # Search of leftovers: least contrast between neighbouring samples; sampling steps; masks for the contrast and
-# for a square with contrast; reach of the paper around a marker, in sides; margin of an area. The last two
-# are limits: a share of the image, and a number of areas. Above them, one search of the whole image is
-# faster.
+# for a square with contrast; reach of the paper around a marker, in sides; margin of an area.
 _CONTRAST = 30
 _FINER, _COARSER = 2, 3
 _STEP_PX = _FINER * _SHRINK
 _AROUND, _SQUARE = np.ones((3, 3), dtype=np.uint8), np.ones((4, 4), dtype=np.uint8)
 _PAPER = 0.35
 _CLEAR_PX = 24
-_MOST, _MANY = 0.4, 40
+_CLEAR = np.ones((2 * _CLEAR_PX // _STEP_PX + 1,) * 2, dtype=np.uint8)
 # Share of the contrast: darker samples are the black of a marker.
 _AS_BLACK = 0.1
 # Rows and columns of a whole image.
 WHOLE = (slice(None), slice(None))
-
-
-class Candidate(NamedTuple):
-    """A marker and its approximate corners, (4, 2) in px."""
-
-    id: int
-    corners_px: Array
+# A mask is faster than many areas, or than areas with more than this share of the image.
+_MANY, _MOST = 16, 0.12
+# Bound of the thorough search in one frame, that of 1920 x 1080 px; and the common rows of two parts.
+_MOST_PX, _COMMON_PX = 1920 * 1080, 128
 
 
 def sample(grey: Grey) -> Grey:
     """Return the reduced image: sample k is pixel 3 k + 1."""
+    return _shrink(grey, _SHRINK)
+
+
+def _shrink(grey: Grey, step: int) -> Grey:
     # Single pixels are three times as fast as means of pixels, and as good if cells are wider than 3 px.
-    return np.ascontiguousarray(grey[_SHRINK // 2 :: _SHRINK, _SHRINK // 2 :: _SHRINK])
+    return np.ascontiguousarray(grey[step // 2 :: step, step // 2 :: step])
 
 
-def search(grey: Grey, dictionary: str, region: tuple[slice, slice] = WHOLE) -> list[Candidate]:
+def search(grey: Grey, dictionary: str, region: Area = WHOLE, ids: Ids = None) -> list[Candidate]:
     """Find markers in an image, with approximate corners.
 
     Parameters
@@ -66,98 +78,147 @@ def search(grey: Grey, dictionary: str, region: tuple[slice, slice] = WHOLE) -> 
     grey : (height, width).
     dictionary : OpenCV's name, such as DICT_4X4_100.
     region : rows and columns to search.
+    ids : as for :func:`~ipsys_log.stages.detect.cells.read_markers`.
     """
     part = np.ascontiguousarray(grey[region])
-    return _placed(search_squares(part, dictionary)[0], region)
+    return _placed(search_squares(part, dictionary, ids=ids)[0], region)
 
 
-def search_squares(grey: Grey, dictionary: str, samples: Grey | None = None) -> tuple[list[Candidate], Array]:
+def search_squares(
+    grey: Grey, dictionary: str, samples: Grey | None = None, ids: Ids = None
+) -> tuple[list[Candidate], Array]:
     """Return the markers in a whole image, and the corners (n, 4, 2) of all its squares, as search()."""
-    small = sample(grey) if samples is None else samples
-    corners_px, ids = _read_squares(grey, small, dictionary)
-    others = _read(grey, corners_px[len(ids) :], dictionary)
-    return _candidates(corners_px[: len(ids)], ids) + others, corners_px
+    corners_px = find_squares(grey, samples)
+    return read_markers(grey, corners_px, dictionary, ids), corners_px
 
 
-def _placed(found: list[Candidate], region: tuple[slice, slice]) -> list[Candidate]:
+def _placed(found: list[Candidate], region: Area) -> list[Candidate]:
     if region == WHOLE or not found:
         return found
     origin = np.array([region[1].start or 0, region[0].start or 0], dtype=np.float64)
     return [candidate._replace(corners_px=candidate.corners_px + origin) for candidate in found]
 
 
-def find_squares(grey: Grey, dictionary: str) -> Array:
+def find_squares(grey: Grey, samples: Grey | None = None) -> Array:
     """Return the corners (n, 4, 2) in px of all squares in an image, markers and others."""
-    return _read_squares(grey, sample(grey), dictionary)[0]
-
-
-def _read_squares(grey: Grey, small: Grey, dictionary: str) -> tuple[Array, list[int]]:
-    """Return the corners (n, 4, 2) of squares, and the ids of the first of them, which are markers."""
+    small = sample(grey) if samples is None else samples
     if not small.size:
-        return np.empty((0, 4, 2)), []
-    marker_corners, ids, rejected = _quick_detector(dictionary).detectMarkers(small)
-    squares = [*marker_corners, *rejected]
-    if not squares:
-        return np.empty((0, 4, 2)), []
-    rough = np.concatenate(squares).reshape(-1, 1, 2) * np.float32(_SHRINK) + np.float32(_SHRINK // 2)
-    corners_px = cv2.cornerSubPix(grey, rough, _NEAR, (-1, -1), _REFINE).reshape(-1, 4, 2).astype(np.float64)
-    # OpenCV 5 returns ids of shape (n,), OpenCV 4 returns ids of shape (n, 1), or None.
-    return corners_px, [] if ids is None else [int(n) for n in np.ravel(ids)]
+        return np.empty((0, 4, 2))
+    threshold = _QUICK._replace(shortest_px=_SHORTEST * max(small.shape))
+    return _refine(grey, find_quads(small, threshold), _SHRINK, _NEAR)
 
 
-def search_thoroughly(grey: Grey, dictionary: str, region: tuple[slice, slice] = WHOLE) -> list[Candidate]:
-    """Find markers, also those in shadow, with the default settings of OpenCV's detector, at full size."""
-    marker_corners, ids, _ = _full_detector(dictionary).detectMarkers(np.ascontiguousarray(grey[region]))
-    return _placed(_candidates(marker_corners, ids), region)
+def _refine(grey: Grey, quads: NDArray[np.float32], step: int, window: tuple[int, int]) -> Array:
+    """Return the refined corners (n, 4, 2) of squares in an image of every ``step``-th pixel."""
+    if not len(quads):
+        return np.empty((0, 4, 2))
+    rough = quads.reshape(-1, 1, 2) * np.float32(step) + np.float32(step // 2)
+    return cv2.cornerSubPix(grey, rough, window, (-1, -1), _REFINE).reshape(-1, 4, 2).astype(np.float64)
 
 
-def search_unexplained_areas(
-    grey: Grey, dictionary: str, samples: Grey, known_px: Sequence[Array]
+def split(shape: tuple[int, ...], region: Area = WHOLE) -> list[Area]:
+    """Return the parts of a region of an image (height, width), each small enough for one frame."""
+    (top, bottom, _), (left, right, _) = (
+        part.indices(size) for part, size in zip(region, shape, strict=True)
+    )
+    height = max(_MOST_PX // max(right - left, 1), 2 * _COMMON_PX)
+    starts = range(top, max(bottom - _COMMON_PX, top + 1), height - _COMMON_PX)
+    return [(slice(start, min(start + height, bottom)), slice(left, right)) for start in starts]
+
+
+def take(areas: list[Area]) -> list[Area]:
+    """Remove from ``areas`` and return those that one frame searches: the first, up to the bound."""
+    sizes_px = [math.prod(part.stop - part.start for part in area) for area in areas]
+    count = max(sum(total <= _MOST_PX for total in accumulate(sizes_px)), 1)
+    taken, areas[:] = areas[:count], areas[count:]
+    return taken
+
+
+def search_thoroughly(
+    grey: Grey,
+    dictionary: str,
+    region: Area = WHOLE,
+    ids: Ids = None,
+    mask: Grey | None = None,
+    is_faint: bool = False,
 ) -> list[Candidate]:
-    """Search thoroughly in areas with contrast that no known marker, (4, 2) in px, explains.
+    """Find markers, also small ones and those in shadow, with approximate corners.
+
+    Parameters
+    ----------
+    grey, dictionary, region, ids : as for :func:`search`.
+    mask : the places to search, 255 in every ``_STEP_PX``-th pixel; None: all.
+    is_faint : search at half size without the mask, for markers with little contrast.
+    """
+    part = np.ascontiguousarray(grey[region])
+    candidates = []
+    for step, threshold in _THOROUGH:
+        scaled = part if step == 1 else _shrink(part, step)
+        if not scaled.size:
+            continue
+        places = None if is_faint and step > 1 else _scaled(mask, grey, region, step)
+        quads = find_quads(scaled, threshold, places)
+        quads = quads[may_be_markers(part, quads.astype(np.float64) * step + step // 2, dictionary)]
+        for window in _WINDOWS:
+            candidates += read_markers(part, _refine(part, quads, step, window), dictionary, ids)
+    return _placed(candidates, region)
+
+
+def _scaled(mask: Grey | None, grey: Grey, region: Area, step: int) -> Grey | None:
+    """Return a mask for the region of an image of every ``step``-th pixel."""
+    if mask is None:
+        return None
+    height, width = (-(-size // _STEP_PX) * _STEP_PX for size in grey.shape)
+    whole = cv2.resize(mask, (width, height), interpolation=cv2.INTER_NEAREST)
+    part = whole[: grey.shape[0], : grey.shape[1]][region]
+    return np.ascontiguousarray(part[step // 2 :: step, step // 2 :: step])
+
+
+def find_unexplained_areas(
+    grey: Grey, samples: Grey, known_px: Sequence[Array], is_whole: bool = False
+) -> tuple[list[Area], Grey | None]:
+    """Return areas with contrast that no known marker, (4, 2) in px, explains, and a mask if it is faster.
+
+    Lines and the edges of large objects also have contrast, but not everywhere in a square.
 
     Parameters
     ----------
     samples : reduced image, from :func:`sample`.
-    """
-    candidates = []
-    for region in _contrasts(grey, samples, known_px):
-        candidates += search_thoroughly(grey, dictionary, region)
-    return candidates
+    is_whole : return the whole image and a mask.
 
-
-def _contrasts(grey: Grey, samples: Grey, known_px: Sequence[Array]) -> list[tuple[slice, slice]]:
-    """Return rows and columns of areas with the contrast of a marker, without known markers.
-
-    Lines and the edges of large objects also have contrast, but not everywhere in a square.
+    Returns
+    -------
+    Rows and columns, and 255 in the areas and their margins, in every ``_STEP_PX``-th pixel.
     """
     fine = np.ascontiguousarray(samples[_FINER // 2 :: _FINER, _FINER // 2 :: _FINER])
     # At the fine scale, there is no contrast inside the cells of a large marker.
     coarse = np.ascontiguousarray(fine[_COARSER // 2 :: _COARSER, _COARSER // 2 :: _COARSER])
+    full = np.zeros([-(-size // _STEP_PX) for size in grey.shape], dtype=np.uint8)
     if not coarse.size:
-        return [WHOLE]
-    full, wide = _squares(fine), _squares(coarse)
+        return split(grey.shape), None
+    inner, wide = _squares(fine), _squares(coarse)
     known = _spans(known_px)
-    down, right = wide.shape[0] / full.shape[0], wide.shape[1] / full.shape[1]
+    down, right = wide.shape[0] / inner.shape[0], wide.shape[1] / inner.shape[1]
     for rows, columns in known:
         # Only the coarse samples that are completely inside the known marker.
         wide[_inner(rows, down), _inner(columns, right)] = 0
     if cv2.countNonZero(wide):
-        widened = cv2.resize(wide, full.shape[::-1], interpolation=cv2.INTER_NEAREST)
-        cv2.bitwise_or(full, widened, full)
+        widened = cv2.resize(wide, inner.shape[::-1], interpolation=cv2.INTER_NEAREST)
+        cv2.bitwise_or(inner, widened, inner)
     for rows, columns in known:
-        full[rows, columns] = 0
-    if not cv2.countNonZero(full):
-        return []
-    contours, _ = cv2.findContours(full, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+        inner[rows, columns] = 0
+    contours, _ = cv2.findContours(inner, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     boxes = [cv2.boundingRect(contour) for contour in contours]
-    if sum(width * height for *_, width, height in boxes) > _MOST * full.size or len(boxes) > _MANY:
-        return [WHOLE]
-    return [
-        (_widened(top, height), _widened(left, width))
-        for left, top, width, height in boxes
-        if not _is_cut(grey, fine, left, top, left + width, top + height)
-    ]
+    share = sum(math.prod(box[2:]) for box in boxes) / inner.size
+    if not is_whole and len(boxes) <= _MANY and share <= _MOST:
+        areas = [
+            (_widened(top, height), _widened(left, width))
+            for left, top, width, height in boxes
+            if not _is_cut(grey, fine, left, top, left + width, top + height)
+        ]
+        return [part for area in areas for part in split(grey.shape, area)], None
+    cv2.drawContours(full, contours, -1, 255, cv2.FILLED)
+    return split(grey.shape), np.asarray(cv2.dilate(full, _CLEAR), dtype=np.uint8)
 
 
 def _spans(known_px: Sequence[Array]) -> list[tuple[slice, slice]]:
@@ -195,109 +256,15 @@ def _is_cut(grey: Grey, fine: Grey, left: int, top: int, right: int, bottom: int
     return min(int(line.min()) for line in lines) < darkest + _AS_BLACK * (brightest - darkest)
 
 
+def _widened(first: int, count: int) -> slice:
+    return slice(max(first * _STEP_PX - _CLEAR_PX, 0), (first + count) * _STEP_PX + _CLEAR_PX)
+
+
 def _squares(samples: Grey) -> Grey:
     """Return a mask of the squares with contrast at all samples."""
     contrast = cv2.morphologyEx(samples, cv2.MORPH_GRADIENT, _AROUND)
     high = cv2.threshold(contrast, _CONTRAST, 1, cv2.THRESH_BINARY)[1]
     return np.asarray(cv2.morphologyEx(high, cv2.MORPH_OPEN, _SQUARE), dtype=np.uint8)
-
-
-def _widened(first: int, count: int) -> slice:
-    return slice(max(first * _STEP_PX - _CLEAR_PX, 0), (first + count) * _STEP_PX + _CLEAR_PX)
-
-
-def _candidates(found: Iterable[Any], ids: Any) -> list[Candidate]:
-    numbers = [] if ids is None else np.ravel(ids).tolist()
-    return [
-        Candidate(n, np.asarray(square, dtype=np.float64).reshape(4, 2))
-        for n, square in zip(numbers, found, strict=True)
-    ]
-
-
-def _known(dictionary: str) -> cv2.aruco.Dictionary:
-    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
-
-
-@cache
-def _quick_detector(dictionary: str) -> cv2.aruco.ArucoDetector:
-    parameters = cv2.aruco.DetectorParameters()
-    parameters.adaptiveThreshWinSizeMin = parameters.adaptiveThreshWinSizeMax = _WINDOW_PX
-    parameters.adaptiveThreshConstant = _DARKER
-    parameters.polygonalApproxAccuracyRate = _ROUNDED
-    parameters.minDistanceToBorder = _BORDER_PX
-    return cv2.aruco.ArucoDetector(_known(dictionary), parameters)
-
-
-@cache
-def _full_detector(dictionary: str) -> cv2.aruco.ArucoDetector:
-    parameters = cv2.aruco.DetectorParameters()
-    parameters.minDistanceToBorder = _BORDER_PX
-    # Bits are read from 8 px per cell instead of 4: this finds more small and tilted markers.
-    parameters.perspectiveRemovePixelPerCell = 8
-    return cv2.aruco.ArucoDetector(_known(dictionary), parameters)
-
-
-def _read(grey: Grey, corners: Array, dictionary: str) -> list[Candidate]:
-    """Return the markers among the squares (n, 4, 2), by their cells."""
-    if not len(corners):
-        return []
-    words = _words(dictionary)
-    levels = read_cells(grey, corners, round(words.shape[1] ** 0.5))
-    middle = levels.min(axis=1) / 2 + levels.max(axis=1) / 2
-    signs = np.where(levels > middle[:, None], np.float32(1), np.float32(-1))
-    # Number of cells that differ, (squares, ids * turns).
-    differ = (words.shape[1] - signs @ words.T) / 2
-    best = differ.argmin(axis=1)
-    candidates = []
-    for n in np.flatnonzero(differ.min(axis=1) <= _MISREAD).tolist():
-        marker_id, turns = divmod(int(best[n]), 4)
-        candidates.append(Candidate(marker_id, np.roll(corners[n], -turns, axis=0)))
-    return candidates
-
-
-def count_wrong_cells(grey: Grey, marker_id: int, corners_px: Array, dictionary: str) -> int:
-    """Return the number of cells in a square (4, 2) that clearly have another colour than those of an id."""
-    cells = len(white_cells(dictionary, marker_id))
-    samples = [read_cells(grey, corners_px[None], cells, *aside)[0] for aside in CELL_SAMPLES.tolist()]
-    return count_contradictions(np.array(samples), dictionary, marker_id)
-
-
-def read_cells(grey: Grey, corners_px: Array, cells: int, right: float = 0.0, down: float = 0.0) -> Array:
-    """Return the grey levels (n, cells * cells) of squares (n, 4, 2): at the middles of their cells.
-
-    Parameters
-    ----------
-    cells : number of cells along a side, border included.
-    right, down : distance from the middles, in cells.
-    """
-    positions = _positions(cells, right, down)
-    x, y = (np.ascontiguousarray(corners_px[..., axis] @ positions.T, dtype=np.float32) for axis in (0, 1))
-    return levels_at(grey, x, y)
-
-
-@cache
-def _positions(cells: int, right: float, down: float) -> Array:
-    """Return the weights (cells * cells, 4) of the corners of a square at the points of its cells.
-
-    Perspective and lens distortion bend a square of this size only a little, so linear interpolation between
-    the corners is sufficient.
-    """
-    steps = np.arange(cells) + 0.5
-    x, y = (axis.ravel() / cells for axis in np.meshgrid(steps + right, steps + down))
-    return np.stack([(1 - x) * (1 - y), x * (1 - y), x * y, (1 - x) * y], axis=1)
-
-
-@cache
-def _words(dictionary: str) -> NDArray[np.float32]:
-    """Return the cells of all markers of a dictionary, (ids * 4, cells), border included.
-
-    They are 1 for white and -1 for black, turned by 0 to 3 quarters.
-    """
-    images = [white_cells(dictionary, n) for n in range(len(_known(dictionary).bytesList))]
-    # If the marker's top left is corner k of a square, the square shows the marker turned k quarters
-    # clockwise.
-    turned = [np.rot90(image, -turn).ravel() for image in images for turn in range(4)]
-    return np.where(turned, np.float32(1), np.float32(-1))
 
 
 # OpenCV corrects wrong cells, up to three of 6x6, and a third of the border. More than one is another print.

@@ -123,6 +123,11 @@ class Rig:
         """The markers of the robots, and the reference markers."""
         return (*self.markers, *self.reference_markers)
 
+    @property
+    def is_simulated(self) -> bool:
+        """True if all cameras are those of the simulated lab."""
+        return bool(self.cameras) and all(str(one.source).startswith("sim:") for one in self.cameras)
+
     def camera(self, name: str) -> RigCamera:
         """Return the entry of a camera; an empty entry for a camera that is not in the rig."""
         return next((camera for camera in self.cameras if camera.name == name), RigCamera(name))

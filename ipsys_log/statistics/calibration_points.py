@@ -18,7 +18,11 @@ from ipsys_log.units import NS_PER_S
 STILL_ACROSS_M = 0.01
 STILL_ALONG_M = 0.04
 # The number of calibration points for errors of millimetres with a drive, and of a centimetre without one.
-ENOUGH_POINTS = "4 with a drive, or 15 for each camera with the tape alone"
+ENOUGH_DRIVE_POINTS = 4
+ENOUGH_TAPE_POINTS = 15
+ENOUGH_POINTS = (
+    f"{ENOUGH_DRIVE_POINTS} with a drive, or {ENOUGH_TAPE_POINTS} for each camera with the tape alone"
+)
 # In a longer gap of the sightings, the marker may have moved.
 LONGEST_GAP_NS = 2 * NS_PER_S
 _FARTHEST_M = 10_000.0

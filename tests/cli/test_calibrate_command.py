@@ -17,8 +17,10 @@ import pytest
 from ipsys_log.calibration.images import find_sources
 from ipsys_log.engine.output import write_log
 from ipsys_log.exchange.calibration_files import read_intrinsics
+from ipsys_log.exchange.lab_files import load_lenses
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedImage, CompressedVideo, Message, image_topic
+from ipsys_log.messages.rig_file import load_rig
 from tests.calibration.boards_seen import chessboard_pattern, fisheye_rays, pixels_of, random_pose, render
 from tests.capture.streams import ffmpeg
 from tests.conftest import Done, Ipsys
@@ -93,6 +95,20 @@ def test_a_folder_of_pictures(ipsys: Ipsys, red: Path, monkeypatch: pytest.Monke
     picture = cv2.imread(str(red.parent / "red.png"))
     assert picture is not None
     assert picture.shape[1] > 1000
+
+
+def test_result_is_written_into_the_rig(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:
+    rig = tmp_path / "labs" / "lab.toml"
+    rig.parent.mkdir()
+    ipsys("init", rig)
+    assert "add --rig lab.toml" in calibrate(ipsys, red, "--board", "6x4", "--write").err
+    done = calibrate(ipsys, red, "--board", "6x4", "--rig", rig, "--write", "-o", tmp_path / "lenses")
+    assert done.code == 0, done.err
+    assert load_rig(rig).camera("red").calibration == "../lenses/red.yaml"
+    assert "put into lab.toml" not in done.out
+    # The path is relative to the rig: the cameras of the lab can be opened with it.
+    lenses = load_lenses(rig, [load_rig(rig).camera("red")], {})
+    assert lenses["red"].K[0, 0] == pytest.approx(LENS[0], rel=0.01)
 
 
 def test_all_of_it_as_json_and_in_all_formats(ipsys: Ipsys, red: Path, tmp_path: Path) -> None:

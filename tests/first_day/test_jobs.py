@@ -9,7 +9,7 @@ import pytest
 
 from ipsys_log.app.first_day.jobs import Job, Jobs
 from ipsys_log.app.first_day.lab_folder import LabFolder
-from ipsys_log.app.first_day.work import fit_and_evaluate
+from ipsys_log.app.first_day.work import calibrate_lab
 from ipsys_log.errors import IpsysError
 
 
@@ -61,7 +61,7 @@ def test_stopped_fit_keeps_the_log_and_is_no_error(lab: Path, tmp_path: Path) ->
 
     def fit(job: Job) -> None:
         job.stop()  # as the user, before the first frame is processed
-        fit_and_evaluate(folder, job)
+        calibrate_lab(folder, job)
 
     jobs.start("the fit", fit)
     jobs.close()

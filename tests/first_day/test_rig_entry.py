@@ -6,6 +6,7 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -36,6 +37,10 @@ FAULTS = [
     ("first_y_m", "1000", "is too large for m"),
     ("robots", "1, x", "marker id x is not a number"),
     ("robots", "0 100", "has only the ids 0 to 99"),
+    ("marker_height_m", "10", "0.1 if it is in cm"),
+    ("height_0", "12", "0.12 if it is in cm"),
+    ("point_marker", "0", "this marker is on a robot"),
+    ("ab_m", "2.1", "the coordinates of A and B give 2.438 m"),
 ]
 
 
@@ -60,12 +65,15 @@ def test_several_wrong_values_are_faults_of_all_their_fields() -> None:
 
 
 def test_reference_points_that_give_poor_positions_are_warned_of() -> None:
-    assert rig_warnings(example_rig()) == []
-    rig, _ = check_rig_entry({"second_x_m": "1.3"}, example_rig())
+    (missing,) = rig_warnings(example_rig())
+    assert "height of the robots' markers is missing" in missing
+    example = replace(example_rig(), marker_height_m=0.1)
+    assert rig_warnings(example) == []
+    rig, _ = check_rig_entry({"second_x_m": "1.3"}, example)
     assert rig is not None
     (warning,) = rig_warnings(rig)
     assert "0.08 m apart" in warning
-    rig, _ = check_rig_entry({"second_x_m": "9"}, example_rig())
+    rig, _ = check_rig_entry({"second_x_m": "9"}, example)
     assert rig is not None
     assert rig_warnings(rig) == ["reference point B is outside the floor"]
 
@@ -73,11 +81,19 @@ def test_reference_points_that_give_poor_positions_are_warned_of() -> None:
 def test_saved_fields_are_read_again(tmp_path: Path) -> None:
     path = tmp_path / "lab.toml"
     typed = {"name": 'a "hall"', "marker_length_m": "0.15", "robots": "3, 7", "second_x_m": "2.5"}
+    typed |= {"marker_height_m": "0.1", "height_7": "0.25", "point_marker": "12"}
     assert save_rig_entry(path, {**typed, "second_x_m": "2,5"}) == []
     rig = load_rig(path)
     assert (rig.name, rig.marker_length_m) == ('a "hall"', 0.15)
-    assert [(marker.id, marker.robot) for marker in rig.markers] == [(3, "robot_3"), (7, "robot_7")]
+    markers = [(marker.id, marker.robot, rig.height_of(marker.id)) for marker in rig.markers]
+    assert markers == [(3, "robot_3", 0.1), (7, "robot_7", 0.25), (12, None, 0.0)]
     assert {**rig_fields(rig), **typed} == rig_fields(rig)
+    # The tape moves B along the line from A; an empty height is no value.
+    assert save_rig_entry(path, {"second_y_m": "3.6", "ab_m": "1.75", "marker_height_m": ""}) == []
+    rig, (a, b) = load_rig(path), load_rig(path).reference_points
+    assert np.hypot(b.x_m - a.x_m, b.y_m - a.y_m) == pytest.approx(1.75, abs=1e-4)
+    assert (b.y_m - a.y_m) / (b.x_m - a.x_m) == pytest.approx(1.1616 / 1.2808, rel=1e-3)
+    assert (rig.marker_height_m, rig.height_of(7)) == (None, 0.25)
     # A field that a page does not send keeps its value.
     assert save_rig_entry(path, {"name": "b"}) == []
     assert load_rig(path).reference_points == rig.reference_points
@@ -87,11 +103,17 @@ def test_robots_keep_their_names_and_other_markers_stay(tmp_path: Path) -> None:
     path = tmp_path / "lab.toml"
     assert save_rig_entry(path, {}) == []
     path.write_text(
-        f'{path.read_text()}\n[[markers]]\nid = 5\nrobot = "ada"\n\n[[markers]]\nid = 9\nheight_m = 0.1\n'
+        f'{path.read_text()}\n[[markers]]\nid = 5\nrobot = "ada"\n\n[[markers]]\nid = 8\nheight_m = 0.1\n'
     )
     assert save_rig_entry(path, {"robots": "5 6"}) == []
     markers = [(one.id, one.robot, one.height_m) for one in load_rig(path).markers]
-    assert markers == [(5, "ada", None), (6, "robot_6", None), (9, None, 0.1)]
+    assert markers == [(5, "ada", None), (6, "robot_6", None), (9, None, 0.0), (8, None, 0.1)]
+    # Without robots, all ids count: the marker for points would be the only one.
+    assert save_rig_entry(path, {"robots": "", "point_marker": "9"}) == []
+    assert [one.id for one in load_rig(path).markers] == [9, 8]
+    path.unlink()
+    assert save_rig_entry(path, {"robots": ""}) == []
+    assert load_rig(path).markers == ()
 
 
 def test_named_cameras_are_written_with_their_settings(tmp_path: Path) -> None:

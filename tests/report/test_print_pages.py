@@ -206,11 +206,14 @@ def test_impossible_prints_are_refused(
 
 
 def test_marker_too_large_for_a4_goes_onto_a3(ipsys: Ipsys, tmp_path: Path) -> None:
-    """The example rig has markers of 20 cm."""
     rig, path = tmp_path / "lab.toml", tmp_path / "m.pdf"
     ipsys("init", rig)
-    done = ipsys("markers", "--rig", rig, "-o", path)
-    assert "1 page of A3" in done.out
+    # The example's markers fit on both usual papers.
+    for page in ("a4", "letter"):
+        assert ipsys("markers", "--rig", rig, "-o", path, "--page", page, "--force").code == 0
+    rig.write_text(rig.read_text().replace("marker_length_m = 0.14", "marker_length_m = 0.2"))
+    done = ipsys("markers", "--rig", rig, "-o", path, "--force")
+    assert "2 pages of A3, 2 markers" in done.out
     assert "A4 is too small" in done.out
     (corners_mm,) = detected(rendered(path)[0], "DICT_4X4_100").values()
     assert np.abs(sides_mm(corners_mm) - 200).max() < 0.1
@@ -219,3 +222,7 @@ def test_marker_too_large_for_a4_goes_onto_a3(ipsys: Ipsys, tmp_path: Path) -> N
     assert "exists already" in done.err
     assert ipsys("markers", "--rig", rig, "-o", path, "--force").code == 0
     assert path.read_bytes() == before
+    ipsys("init", tmp_path / "sim.toml", "--simulated")
+    done = ipsys("markers", "--rig", tmp_path / "sim.toml", "-o", path, "--force")
+    assert "3 pages of A4, 3 markers" in done.out
+    assert "the simulated lab needs none" in done.out

@@ -28,7 +28,7 @@ from tests.web.test_setup_browser import focus
 pytestmark = pytest.mark.slow
 
 PHONE, DESKTOP = (390, 844), (1280, 900)
-STEPS = ("rig", "cameras", "intrinsics", "alignment", "points", "accuracy", "live")
+STEPS = ("rig", "cameras", "intrinsics", "alignment", "drive", "points", "accuracy", "live")
 
 
 def check(browser: Phone, place: object) -> None:
@@ -107,8 +107,8 @@ def test_last_steps_of_the_setup_need_only_the_keyboard(browser: Phone, folder: 
         browser.wait("document.querySelector('#step-accuracy')")
         focus(browser, "#step-accuracy")
         press(browser, "Enter", "\r")
-        says(browser, "h2", "6. Fit and evaluation")
-        focus(browser, "#replay")
+        says(browser, "h2", "7. Calibration")
+        focus(browser, "#calibrate-lab")
         press(browser, "Enter", "\r")
         wait_until(
             lambda: setup.session.jobs.present is not None and setup.session.jobs.present.ended,
@@ -121,7 +121,7 @@ def test_last_steps_of_the_setup_need_only_the_keyboard(browser: Phone, folder: 
         browser.wait("document.querySelector('#onward')")
         focus(browser, "#onward")
         press(browser, "Enter", "\r")
-        says(browser, "h2", "7. Live view")
+        says(browser, "h2", "8. Live view")
         focus(browser, "#live")
         leave(browser)
         setup.session.close()

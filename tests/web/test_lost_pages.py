@@ -130,7 +130,7 @@ def test_frozen_page_of_a_measuring_does_not_stop_it(browser: Phone, folder: Pat
 def test_page_shows_the_present_state_after_a_lost_network(browser: Phone, folder: Path) -> None:
     with setup_page(folder) as page, Relay(page.parts.port or 0) as relay:
         browser.open(f"http://127.0.0.1:{relay.port}/", DESKTOP)
-        says(browser, "#state", "0 of 7")
+        says(browser, "#state", "0 of 8")
         relay.cut(closes=False)
         says(browser, "#state", "ipsys does not answer")
         says(browser, "#operation", "the buttons wait")
@@ -140,12 +140,12 @@ def test_page_shows_the_present_state_after_a_lost_network(browser: Phone, folde
         assert page.ask("/api/simulate", {}) == (200, {})
         assert page.ask("/api/operate", {"release": page.operator}) == (200, {})
         relay.mend()
-        says(browser, "#state", "3 of 7")
+        says(browser, "#state", "3 of 8")
         says(browser, "#panel", "simulated_lab")
         browser.wait("!document.querySelector('#save').disabled")
         browser.run("document.querySelector('#name').value = 'hall'")
         browser.tap("#save")
-        says(browser, "#folder", "hall")
+        says(browser, "#panel", "hall: DICT")
         leave(browser)
 
 
@@ -154,13 +154,13 @@ def test_page_goes_on_when_the_command_is_started_again(browser: Phone, folder: 
     with setup_page(folder, port) as page:
         browser.open(page.parts.geturl(), DESKTOP)
         Visitor(browser).tap("#simulate")
-        says(browser, "#state", "3 of 7")
+        says(browser, "#state", "3 of 8")
     says(browser, "#state", "ipsys does not answer")
     with setup_page(folder, port):
-        says(browser, "#state", "3 of 7")
+        says(browser, "#state", "3 of 8")
         # The new server has no operator: this device operates by its next change.
         browser.run("document.querySelector('#name').value = 'hall'")
         browser.tap("#save")
-        says(browser, "#folder", "hall")
+        says(browser, "#panel", "hall: DICT")
         says(browser, "#operation", "This device operates")
         leave(browser)

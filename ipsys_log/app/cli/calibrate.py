@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
@@ -24,7 +25,11 @@ if TYPE_CHECKING:
 Sources = Annotated[
     list[Path] | None, file_log_argument(help="Logs, folders of images, images or videos.", metavar="SOURCE")
 ]
-RigNow = Annotated[Path | None, setting("--rig", "FILE", "Without SOURCE: use the cameras of this rig now.")]
+RigNow = Annotated[
+    Path | None,
+    setting("--rig", "FILE", "Without SOURCE: use the cameras of this rig now. With --write: write into it."),
+]
+Write = Annotated[bool, switch("--write", "Name the new file of each camera in --rig.")]
 Seconds = Annotated[
     float, setting("--seconds", "SECONDS", "Without SOURCE: duration, while you move the board.", min=1.0)
 ]
@@ -95,6 +100,7 @@ def calibrate(
     formats: Formats = None,
     plot: Plot = None,
     rig: RigNow = None,
+    write: Write = False,
     seconds: Seconds = 60.0,
     force: Force = False,
     as_json: AsJson = False,
@@ -108,7 +114,7 @@ def calibrate(
     Examples
 
         ipsys calibrate photos/red --board 6x4              # a folder: red.yaml
-        ipsys calibrate --rig lab.toml --board 6x4          # use the cameras now
+        ipsys calibrate --rig lab.toml --board 6x4 --write  # use the cameras now
         ipsys calibrate red.mp4 --board charuco:4x5 --camera red --plot red.png
     """
     from ipsys_log.api import python_api as api
@@ -125,6 +131,8 @@ def calibrate(
         check_format(name, lens)
     if plot is not None:
         _check_free(plot, force)
+    if write:
+        _check_write(rig, camera, names)
     lab = None if sources else _prepare_now(rig, camera, board)
     if lab is not None:
         _targets(lab.names, output, names, force)
@@ -147,6 +155,8 @@ def calibrate(
             ):
                 if isinstance(outcome, CalibrationResult):
                     _write(outcome, targets[outcome.camera])
+                    if write and rig is not None:
+                        _write_into(rig, outcome.camera, targets[outcome.camera]["opencv"])
                     outcomes.append(outcome)
                 else:  # a temporary log is deleted before the user reads the reason
                     reason = outcome.reason.replace(str(taken[0]), SENT_NOW) if lab else outcome.reason
@@ -157,7 +167,7 @@ def calibrate(
         from ipsys_log.app.report.figures import save_figure
 
         save_figure(calibration_figure(lenses), plot, 110)
-    _print_outcomes(outcomes, targets, plot, as_json, for_rig="opencv" in names)
+    _print_outcomes(outcomes, targets, plot, as_json, for_rig="opencv" in names and not write)
 
 
 def _print_outcomes(
@@ -247,6 +257,32 @@ def _check_free(path: Path, force: bool) -> None:
         raise IpsysError(text)
     if path.exists() and not force:
         raise IpsysError(f"{path}: exists already; choose another --output, or give --force to overwrite it")
+
+
+def _check_write(rig: Path | None, cameras: list[str] | None, formats: list[str]) -> None:
+    """Check that the results can be named in the rig file, before the calibration begins."""
+    from ipsys_log.messages.rig_file import load_rig
+
+    if rig is None:
+        raise IpsysError("--write: has no rig file to write into; add --rig lab.toml")
+    if "opencv" not in formats:
+        raise IpsysError("--write: lab.toml names files in the format opencv; add --format opencv")
+    known = [camera.name for camera in load_rig(rig).cameras]
+    for name in cameras or []:
+        if name not in known:
+            raise IpsysError(f"--camera {name}: {rig} has the cameras {', '.join(known) or 'none'}")
+
+
+def _write_into(rig: Path, camera: str, file: Path) -> None:
+    """Name the file of a camera in the rig file, relative to its folder."""
+    from ipsys_log.app.first_day.camera_choice import set_calibration
+    from ipsys_log.messages.rig_file import load_rig
+
+    if camera not in [one.name for one in load_rig(rig).cameras]:
+        warn(f"{rig}: has no camera {camera}; add it, with calibration = {file.as_posix()!r}")
+        return
+    set_calibration(rig, camera, os.path.relpath(file, rig.parent).replace(os.sep, "/"))
+    say(f"{rig}: camera {camera} has this calibration now")
 
 
 def _write(one: CalibrationResult, paths: dict[str, Path]) -> None:

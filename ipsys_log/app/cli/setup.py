@@ -272,6 +272,7 @@ def markers(
     """
     check_installed("markers needs", "matplotlib")
     from ipsys_log.app.report.prints import board_print, choose_paper, draw_pages, lay_out
+    from ipsys_log.messages.rig_file import load_rig
 
     if output.suffix.lower() != ".pdf":
         raise IpsysError(f"--output {output}: only a PDF keeps the true size; use a name that ends in .pdf")
@@ -290,7 +291,9 @@ def markers(
     pages = lay_out(prints, paper)
     write_files(output.parent, {output.name: draw_pages(pages)})
     console.print(f"{output} written: {counted(len(pages), 'page')} of {paper.name}, {_contents(prints)}")
-    if page is None and paper.name != "A4":
+    if rig is not None and ids is None and load_rig(rig).is_simulated:
+        console.print("these are its robots' markers, to try a print: the simulated lab needs none")
+    elif page is None and paper.name != "A4":
         console.print("A4 is too small. Print on A3, or use --length 0.14 for markers that fit on A4")
     console.print('print at 100 % ("actual size"), and check that the printed ruler is 10 cm long')
 

@@ -71,7 +71,8 @@ def read_result(session: Session, run: str) -> AlignmentResult:
         for one in lab.alignments
         if one.camera in lenses
     )
-    return AlignmentResult(cameras, tuple(coverage_lines(lab)), lab.notes)
+    # The markers and the floor of the simulated lab need no change.
+    return AlignmentResult(cameras, tuple(coverage_lines(lab)), () if rig.is_simulated else lab.notes)
 
 
 def _camera(one: Alignment, lens: CameraCalibration, picture: bytes | None, rig: Rig) -> AlignedCamera:

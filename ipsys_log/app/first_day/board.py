@@ -43,13 +43,18 @@ class BoardEntry(NamedTuple):
         return parse_board(self.board, self.square_m, self.marker_scale, self.dictionary, self.inverted)
 
 
+# The dictionaries that the page offers.
+DICTIONARIES = (
+    *("DICT_4X4_50", "DICT_4X4_100", "DICT_4X4_250", "DICT_5X5_100", "DICT_6X6_250"),
+    *("DICT_APRILTAG_25h9", "DICT_APRILTAG_36h11"),
+)
 # The fields of the form: key, label, usual text, and the choices if there is a choice.
 BOARD_FIELDS: tuple[tuple[str, str, str, tuple[str, ...]], ...] = (
     ("board", "Inner corners of the chessboard, such as 6x4", "6x4", ()),
     ("square", "Side of a square, in m", "0.03", ()),
     ("lens", "Lens distortion model", "fisheye", tuple(LENS_MODELS)),
     ("marker_scale", "ChArUco: side of a marker, as a share of a square", "0.75", ()),
-    ("dictionary", "ChArUco: dictionary of the markers", "DICT_4X4_50", ()),
+    ("dictionary", "ChArUco: dictionary of the markers", "DICT_4X4_50", DICTIONARIES),
     ("inverted", "ChArUco: black and white exchanged", "no", ("no", "yes")),
 )
 

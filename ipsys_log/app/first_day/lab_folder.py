@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import chain, count
 from pathlib import Path
 
@@ -17,18 +17,25 @@ from ipsys_log.app.report.summary import answer_json, answer_text
 from ipsys_log.engine.graph import writes
 from ipsys_log.engine.provenance import newest_run
 from ipsys_log.engine.states import recorded_stages
+from ipsys_log.engine.view import LogView
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.lab_files import tape_sheet_path
 from ipsys_log.live_runs.survey.from_log import exclude
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.merged_logs import find_new_ids
 from ipsys_log.messages import LATENCY_TOPIC, Measurement
-from ipsys_log.messages.channels import CAMERA_POINTS, EVALUATION, MEASUREMENTS, TRACKS
-from ipsys_log.statistics.calibration_points import active_measurements
-from ipsys_log.units import CM_PER_M
+from ipsys_log.messages.channels import CAMERA_POINTS, EVALUATION, MEASUREMENTS, MODEL, RIG, TRACKS
+from ipsys_log.statistics.calibration_points import (
+    active_measurements,
+    find_pairs,
+    locate_measurements,
+    measured,
+)
+from ipsys_log.units import CM_PER_M, NS_PER_S
 
-# The names of logs of an alignment begin with this.
+# The names of logs of an alignment, and of a drive, begin with these.
 ALIGNMENT_LOG = "alignment"
+DRIVE_LOG = "drive"
 _SUFFIX = ".mcap"
 _MOST_LOGS = 200
 _Stamp = tuple[tuple[str, int, int], ...]
@@ -41,6 +48,9 @@ class LogFacts:
     Attributes
     ----------
     points : number of calibration points that are not withdrawn.
+    places_m : (x, y) of these points.
+    seen : the number of these points that each camera saw; empty before the detection.
+    drive_s : duration of a drive; 0 for other logs.
     tracked : number of messages with tracks of a live recording.
     alignment : the result of an alignment; None for other logs.
     fault : the reason if the log cannot be read.
@@ -49,6 +59,9 @@ class LogFacts:
     path: Path
     start_ns: int = 0
     points: int = 0
+    places_m: tuple[tuple[float, float], ...] = ()
+    seen: Mapping[str, int] = field(default_factory=dict)
+    drive_s: float = 0.0
     tracked: int = 0
     alignment: AlignmentResult | None = None
     fault: str = ""
@@ -56,14 +69,16 @@ class LogFacts:
 
 @dataclass(frozen=True, slots=True)
 class FitFacts:
-    """The newest evaluation of the calibration logs.
+    """The newest fit to the calibration logs, of ``model``, in ``log``.
 
     ``answer`` are the sentences of ``ipsys replay``, ``mean_m`` the mean distance to the tape points.
-    ``outliers`` are the points that contradict the fit. ``stale`` is the reason if the evaluation is out of
-    date; "" if it is current.
+    ``outliers`` are the points that contradict the fit. Without an evaluation, they are empty. ``stale`` is
+    the reason if the fit or its evaluation is out of date; "" if it is current.
     """
 
     run: str
+    model: str
+    log: Path
     stale: str
     answer: tuple[str, ...]
     mean_m: float | None
@@ -118,11 +133,15 @@ class LabFolder:
         return sorted((one for one in facts if one is not None), key=lambda one: (one.start_ns, one.path))
 
     def calibration_logs(self) -> list[Path]:
-        """Return the logs with calibration points, in the order of their time."""
-        return [log.path for log in self.logs() if log.points]
+        """Return the logs with calibration points or drives, in the order of their time."""
+        return [log.path for log in self.logs() if log.points or log.drive_s]
+
+    def has_drive(self) -> bool:
+        """Return whether a log has a drive."""
+        return any(log.drive_s for log in self.logs())
 
     def fit(self) -> FitFacts | None:
-        """Return the newest evaluation of the calibration logs; None if there is none."""
+        """Return the newest fit to the calibration logs; None if there is none."""
         paths = self.calibration_logs()
         stamp = _stamp(paths)
         if not paths or stamp is None:
@@ -160,14 +179,36 @@ def _stamp(paths: Sequence[Path]) -> _Stamp | None:
 def _read_facts(path: Path) -> LogFacts:
     try:
         with Session([path]) as session:
-            points = len(active_measurements(session.payloads(session.topics(MEASUREMENTS))))
+            active = active_measurements(session.payloads(session.topics(MEASUREMENTS)))
+            places = locate_measurements(active, next(iter(session.payloads(session.topics(RIG))), None))[0]
             # Only a live recording has latencies; the run of a replay does not count.
             run = newest_run(session, TRACKS) if session.count(LATENCY_TOPIC) else None
             tracked = 0 if run is None else session.count(TRACKS.topic_of(run))
-            alignment = None if points or tracked else _read_alignment(session, path)
-            return LogFacts(path, session.start_ns, points, tracked, alignment)
+            is_drive = path.stem.startswith(DRIVE_LOG) and bool(session.images)
+            return LogFacts(
+                path,
+                session.start_ns,
+                len(active),
+                tuple((float(place.point_m[0]), float(place.point_m[1])) for place in places),
+                _count_seen(session) if active else {},
+                (session.end_ns - session.start_ns) / NS_PER_S if is_drive and not tracked else 0.0,
+                tracked,
+                None if active or tracked else _read_alignment(session, path),
+            )
     except (IpsysError, OSError) as error:
         return LogFacts(path, fault=str(error))
+
+
+def _count_seen(session: Session) -> dict[str, int]:
+    """Return the number of calibration points that each camera saw; empty before the detection."""
+    run = newest_run(session, CAMERA_POINTS)
+    if run is None:
+        return {}
+    view = LogView(session, {CAMERA_POINTS: run})
+    try:
+        return {camera: len(pairs) for camera, pairs in find_pairs(view, measured(view)).items()}
+    except IpsysError:  # the fit names the fault
+        return {}
 
 
 def _read_alignment(session: Session, path: Path) -> AlignmentResult | None:
@@ -178,26 +219,36 @@ def _read_alignment(session: Session, path: Path) -> AlignmentResult | None:
 def _read_fit(paths: Sequence[Path]) -> FitFacts | None:
     try:
         with Session(paths) as session:
-            stages = [one for one in recorded_stages(session) if writes(one.run, EVALUATION)]
-            if not stages:
+            stages = recorded_stages(session)
+            fits = [one for one in stages if writes(one.run, MODEL)]
+            if not fits:
                 return None
-            newest = stages[-1]
-            run = newest.run.run
+            newest = fits[-1]
+            run, topics = newest.run.run, session.topics(MODEL, newest.run.run)
             evaluations = session.payloads(session.topics(EVALUATION, run))
-        if not evaluations:
-            return None
-        accuracies = [Accuracy(run, evaluations[-1], None)]
+        accuracies = [Accuracy(run, evaluations[-1], None)] if evaluations else []
         outliers = find_outlier_points(paths, accuracies)
+        log = next(path for path in reversed(paths) if _has_topics(path, topics))
     except IpsysError:
         return None
-    stale = newest.state.partition(": ")[2] if newest.out_of_date else ""
-    mean_m = answer_json(accuracies).get("answer", {}).get("mean_m")
-    return FitFacts(run, stale, _sentences(accuracies), mean_m, outliers)
+    own = (
+        one
+        for one in stages
+        if one.run.run == run and (writes(one.run, MODEL) or writes(one.run, EVALUATION))
+    )
+    stale = next((one.state.partition(": ")[2] for one in own if one.out_of_date), "")
+    mean_m = answer_json(accuracies).get("answer", {}).get("mean_m") if accuracies else None
+    return FitFacts(run, newest.method, log, stale, _sentences(accuracies), mean_m, outliers)
+
+
+def _has_topics(path: Path, topics: Sequence[str]) -> bool:
+    with Session([path]) as session:
+        return any(session.count(topic) for topic in topics)
 
 
 def _sentences(accuracies: Sequence[Accuracy]) -> tuple[str, ...]:
     """Return the lines of the answer, each sentence on one line."""
-    answer = answer_text(accuracies)
+    answer = answer_text(accuracies) if accuracies else None
     if answer is None:
         return ()
     return tuple(" ".join(str(line).split()) for line in answer.renderables)

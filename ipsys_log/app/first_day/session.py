@@ -2,34 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict
+from functools import partial
 from typing import Any, NamedTuple
 
 from ipsys_log.app.first_day import work
 from ipsys_log.app.first_day.alignment import AlignmentResult
-from ipsys_log.app.first_day.board import BOARD_FIELDS, BoardSearch, parse_board_entry
+from ipsys_log.app.first_day.board import BOARD_FIELDS, DICTIONARIES, BoardSearch, parse_board_entry
 from ipsys_log.app.first_day.camera_choice import parse_camera_address, save_cameras, set_calibration
 from ipsys_log.app.first_day.camera_pictures import CameraPictures
+from ipsys_log.app.first_day.drive import DriveCoverage
 from ipsys_log.app.first_day.jobs import Job, Jobs
 from ipsys_log.app.first_day.lab_folder import FitFacts, LabFolder, exclude_outlier
+from ipsys_log.app.first_day.points_plan import describe_map, propose_places
 from ipsys_log.app.first_day.rig_entry import LABELS, example_rig, rig_fields, rig_warnings, save_rig_entry
 from ipsys_log.app.first_day.steps import SetupProgress, Status, read_progress
+from ipsys_log.app.report.calibration import lab_advice, lab_headline, lab_table
 from ipsys_log.app.report.rows import cm
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.lab_files import simulated_lab_texts, write_new
 from ipsys_log.extras import check_installed
 from ipsys_log.live_runs.survey.entry import Fault
+from ipsys_log.live_runs.survey.lab_calibration import LabCalibration
 from ipsys_log.live_runs.survey.live import LiveScene
 from ipsys_log.messages.rig_file import load_rig
 from ipsys_log.sinks.sink import Sink
+from ipsys_log.statistics.calibration_points import ENOUGH_DRIVE_POINTS, ENOUGH_POINTS
 
-# The dictionaries that the page offers first; the field takes any other name of OpenCV, too.
-DICTIONARIES = (
-    *("DICT_4X4_50", "DICT_4X4_100", "DICT_4X4_250", "DICT_5X5_100", "DICT_6X6_250"),
-    *("DICT_APRILTAG_25h9", "DICT_APRILTAG_36h11"),
-)
+# The simulated tape measures so many points at once.
+_SHEET_POINTS = ENOUGH_DRIVE_POINTS
 
 
 class Pages(NamedTuple):
@@ -61,21 +64,25 @@ class SetupSession:
         self._cameras = CameraPictures(folder.rig_file)
         self._search: BoardSearch | None = None
         self._alignment: AlignmentResult | None = None
+        self._drive: DriveCoverage | None = None
+        self._lab: tuple[FitFacts, LabCalibration] | None = None
         self._actions: dict[str, tuple[str, str, Callable[[Job], None]]] = {
             "pictures": ("the pictures of the cameras", "cameras", self._cameras.take_all),
             "align": ("the alignment", "alignment", lambda job: work.align(folder, job)),
-            "sheet": ("the measuring by the sheet", "points", self._measure_sheet),
+            "drive": ("the drive", "drive", lambda job: work.drive(folder, self._show_drive, job)),
+            "sheet": ("the measuring by the sheet", "points", partial(self._measure_sheet, _SHEET_POINTS)),
+            "sheet-all": ("the measuring by the sheet", "points", partial(self._measure_sheet, None)),
             "measure": (
                 "the measuring", "points", lambda job: work.measure(folder, pages.measuring, job),
             ),
-            "replay": ("the fit", "accuracy", lambda job: work.fit_and_evaluate(folder, job)),
+            "calibrate-lab": ("the calibration", "accuracy", self._calibrate_lab),
             "live": ("the live view", "live", lambda job: work.track(folder, pages.dashboard, job)),
         }  # fmt: skip
 
     def describe(self) -> dict[str, Any]:
         """Return the whole state as plain data."""
         progress = read_progress(self._folder)
-        job = self.jobs.present
+        job, drive = self.jobs.present, self._drive
         return {
             "folder": self._folder.path.absolute().name,
             "next": progress.next,
@@ -88,11 +95,19 @@ class SetupSession:
             "board_fields": BOARD_FIELDS,
             "board": self._describe_board(),
             "alignment": self._describe_alignment(progress),
+            "drive": {
+                "logs": [[log.path.name, round(log.drive_s)] for log in progress.logs if log.drive_s],
+                "views": None if drive is None else drive.describe(),
+                "seconds": 0 if drive is None else int(drive.seconds),
+            },
             "points": {
                 "sheet": None if self._folder.sheet is None else self._folder.sheet.name,
-                "logs": [[log.path.name, log.points] for log in progress.logs if log.points],
+                "enough": ENOUGH_POINTS,
+                "logs": [[log.path.name, log.points, dict(log.seen)] for log in progress.logs if log.points],
             },
+            "map": self._describe_map(progress),
             "accuracy": None if progress.fit is None else _describe_fit(progress.fit),
+            "lab": self._describe_lab(progress),
             "tracked": [log.path.name for log in progress.logs if log.tracked],
             "faults": [log.fault for log in progress.logs if log.fault],
             "job": None if job is None else job.describe(),
@@ -170,11 +185,13 @@ class SetupSession:
         self.jobs.start(title, job, action)
 
     def picture(self, kind: str, name: str) -> bytes | None:
-        """Return a picture: ``board`` of the calibration, ``camera`` by number, ``alignment`` by camera."""
+        """Return a picture: ``camera`` by number, ``board``, ``drive`` and ``alignment`` by camera."""
         if kind == "board":
             return None if self._search is None else self._search.picture()
         if kind == "camera":
             return self._cameras.picture(name)
+        if kind == "drive":
+            return None if self._drive is None else self._drive.picture(name)
         cameras = () if self._alignment is None else self._alignment.cameras
         return next((one.picture for one in cameras if one.camera == name), None)
 
@@ -220,11 +237,59 @@ class SetupSession:
         ]
         return {"cameras": cameras, "coverage": result.coverage, "notes": result.notes}
 
-    def _measure_sheet(self, job: Job) -> None:
+    def _measure_sheet(self, count: int | None, job: Job) -> None:
         sheet = self._folder.sheet
         if sheet is None:
             raise IpsysError("the folder has no sheet lab_tape.csv; only the simulated lab has one")
-        work.measure_sheet(self._folder, sheet, job)
+        work.measure_sheet(self._folder, sheet, count, job)
+
+    def _calibrate_lab(self, job: Job) -> None:
+        lab, fit = work.calibrate_lab(self._folder, job), self._folder.fit()
+        self._lab = None if lab is None or fit is None else (fit, lab)
+
+    @contextmanager
+    def _show_drive(self, drive: DriveCoverage) -> Iterator[None]:
+        self._drive = drive
+        try:
+            yield
+        finally:
+            self._drive = None
+
+    def _current_lab(self, progress: SetupProgress) -> LabCalibration | None:
+        """Return the result of the present fit; None after a restart, or if a log has changed since."""
+        return self._lab[1] if self._lab is not None and self._lab[0] == progress.fit else None
+
+    def _describe_map(self, progress: SetupProgress) -> dict[str, Any] | None:
+        """Return the floor with its points; None without a floor."""
+        rig, lab = progress.rig, self._current_lab(progress)
+        if rig is None:
+            return None
+        done_m = [place_m for log in progress.logs for place_m in log.places_m]
+        proposed_m: list[tuple[float, float]] = []
+        if lab is None:
+            proposed_m = propose_places(rig, done_m, max(2 * ENOUGH_DRIVE_POINTS - len(done_m), 0))
+        elif not lab.is_enough:
+            proposed_m = [(float(point.point_m[0]), float(point.point_m[1])) for point in lab.points]
+        return describe_map(rig, done_m, proposed_m)
+
+    def _describe_lab(self, progress: SetupProgress) -> dict[str, Any] | None:
+        """Return the expected errors, and what is missing."""
+        lab = self._current_lab(progress)
+        if lab is None:
+            return None
+        table = lab_table(lab)
+        return {
+            "enough": lab.is_enough,
+            "headline": list(lab_headline(lab)),
+            "advice": [line for line in lab_advice(lab) if line],
+            "title": table.title,
+            "columns": [name.lstrip(">") for name in table.columns],
+            "rows": table.cells,
+            "gap": None
+            if lab.gap is None or lab.is_enough
+            else [lab.gap.low_m.tolist(), lab.gap.high_m.tolist()],
+            "notes": list(lab.notes),
+        }
 
 
 def _describe_fit(fit: FitFacts) -> dict[str, Any]:
@@ -250,4 +315,6 @@ def _print(folder: LabFolder, name: str, typed: Mapping[str, str]) -> bytes:
         prints = [board_print(entry.parse(), entry.board)]
     else:
         raise IpsysError(f"the print {name!r} is not known; reload this page")
-    return draw_pages(lay_out(prints, choose_paper(prints, None)))
+    # A4 means the usual choice: A3 if A4 is too small.
+    paper = typed.get("paper", "A4")
+    return draw_pages(lay_out(prints, choose_paper(prints, None if paper == "A4" else paper)))

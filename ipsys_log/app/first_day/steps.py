@@ -7,7 +7,7 @@ from enum import StrEnum
 from pathlib import Path
 
 from ipsys_log.app.first_day.lab_folder import FitFacts, LabFolder, LogFacts
-from ipsys_log.app.report.rows import cm
+from ipsys_log.app.report.rows import cm, counted
 from ipsys_log.capture.devices import check_sources
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.calibration_files import read_intrinsics
@@ -16,10 +16,14 @@ from ipsys_log.messages import Rig, RigCamera
 from ipsys_log.messages.rig_file import load_rig
 from ipsys_log.models.table import min_pairs
 from ipsys_log.plain_text import join_names, shell_words
+from ipsys_log.statistics.calibration_points import ENOUGH_DRIVE_POINTS, ENOUGH_POINTS, ENOUGH_TAPE_POINTS
 from ipsys_log.vision.lenses import calibration_remarks
 
-# The model that a replay fits, and the number of calibration points that gives good results.
-_MODEL, _GOOD = "poly", 40
+# The model of the tape alone. A drive with two points is the least for the model joint.
+_TAPE_MODEL = "poly"
+_LEAST_POINTS = 2
+# A shorter recording is no drive.
+_LEAST_DRIVE_S = 10.0
 
 
 class Status(StrEnum):
@@ -104,9 +108,10 @@ def read_progress(folder: LabFolder) -> SetupProgress:
         _cameras_step(rig, cameras, camera_fault),
         _intrinsics_step(intrinsics, camera_fault),
         _alignment_step(alignment, cameras, missing),
-        _points_step(rig, logs, missing),
+        _drive_step(rig, cameras, logs, missing),
+        _points_step(rig, cameras, logs, missing),
         _accuracy_step(folder.calibration_logs(), logs, fit),
-        _live_step(folder.calibration_logs(), logs, fit, missing),
+        _live_step(logs, fit, missing),
     )
     return SetupProgress(rig, cameras, intrinsics, logs, alignment, fit, steps)
 
@@ -187,7 +192,40 @@ def _alignment_step(alignment: LogFacts | None, cameras: tuple[RigCamera, ...], 
     return StepState("alignment", title, command, status, f"{text} in {alignment.path.name}")
 
 
-def _points_step(rig: Rig | None, logs: tuple[LogFacts, ...], missing: str) -> StepState:
+def _drive_step(
+    rig: Rig | None, cameras: tuple[RigCamera, ...], logs: tuple[LogFacts, ...], missing: str
+) -> StepState:
+    title, command = "Drive", "ipsys record --rig lab.toml -o drive.mcap"
+    drives = [log for log in logs if log.drive_s]
+    longest_s = max((log.drive_s for log in drives), default=0.0)
+    if longest_s >= _LEAST_DRIVE_S:
+        text = f"{longest_s:.0f} s recorded in {join_names([log.path.name for log in drives])}"
+        return StepState("drive", title, command, Status.DONE, text)
+    if _is_enough_tape(cameras, logs):
+        text = "not needed: there are enough points for the tape alone"
+        return StepState("drive", title, command, Status.DONE, text)
+    if not missing and rig is not None and not _can_drive(rig):
+        missing = "first type the height of the robots' markers in step 1"
+    text = missing or (f"only {longest_s:.0f} s are recorded; drive for two minutes" if drives else "")
+    return StepState("drive", title, command, Status.WAITS if missing else Status.READY, text)
+
+
+def _can_drive(rig: Rig) -> bool:
+    """Return whether the rig has the height of a robot's marker, above the floor."""
+    if not rig.markers:
+        return bool(rig.marker_height_m)
+    return any(rig.height_of(marker.id) for marker in rig.markers)
+
+
+def _is_enough_tape(cameras: tuple[RigCamera, ...], logs: tuple[LogFacts, ...]) -> bool:
+    """Return whether each camera has seen enough points for a calibration with the tape alone."""
+    counts = [sum(log.seen.get(camera.name, 0) for log in logs) for camera in cameras]
+    return bool(counts) and min(counts) >= ENOUGH_TAPE_POINTS
+
+
+def _points_step(
+    rig: Rig | None, cameras: tuple[RigCamera, ...], logs: tuple[LogFacts, ...], missing: str
+) -> StepState:
     count = sum(log.points for log in logs)
     title, command = "Calibration points", "ipsys record --measure --points-only -o calibration.mcap"
     if rig is not None and not missing:
@@ -195,38 +233,41 @@ def _points_step(rig: Rig | None, logs: tuple[LogFacts, ...], missing: str) -> S
             check_references(rig)
         except IpsysError as error:
             missing = str(error)
-    least = min_pairs(_MODEL)
-    if count >= least:
-        more = "" if count >= _GOOD else f"; about {_GOOD} give a good model"
-        return StepState("points", title, command, Status.DONE, f"{count} points measured{more}")
-    text = missing or f"{count} points measured; each camera must see {least} or more"
+    text = counted(count, "point") + " measured"
+    has_drive = any(log.drive_s for log in logs)
+    if (has_drive and count >= ENOUGH_DRIVE_POINTS) or _is_enough_tape(cameras, logs):
+        return StepState("points", title, command, Status.DONE, text)
+    text = missing or f"{text}; enough are {ENOUGH_POINTS}"
     return StepState("points", title, command, Status.WAITS if missing else Status.READY, text)
 
 
 def _accuracy_step(calibration: list[Path], logs: tuple[LogFacts, ...], fit: FitFacts | None) -> StepState:
-    names = shell_words(*(path.name for path in calibration)) or "calibration.mcap"
-    title, command = "Fit and evaluation", f"ipsys replay {names}"
+    has_drive = any(log.drive_s for log in logs)
+    least = _LEAST_POINTS if has_drive else min_pairs(_TAPE_MODEL)
+    names = shell_words(*(path.name for path in calibration)) or "drive.mcap calibration.mcap"
+    command = f"ipsys calibrate-lab {names}"
+    if calibration and not has_drive:
+        command = f"ipsys replay {names} --model {_TAPE_MODEL}"
+    title = "Calibration"
     if fit is not None and not fit.stale:
-        text = "fitted"
+        text = f"calibrated with {fit.model}"
         if fit.mean_m is not None:
             text = f"mean distance to the tape points {cm(fit.mean_m, 1)} cm"
         return StepState("accuracy", title, command, Status.DONE, text)
-    if sum(log.points for log in logs) < min_pairs(_MODEL):
+    if sum(log.points for log in logs) < least:
         return StepState("accuracy", title, command, Status.WAITS, "first measure calibration points")
-    text = f"the fit is out of date: {fit.stale}" if fit else ""
+    text = f"the calibration is out of date: {fit.stale}" if fit else ""
     return StepState("accuracy", title, command, Status.READY, text)
 
 
-def _live_step(
-    calibration: list[Path], logs: tuple[LogFacts, ...], fit: FitFacts | None, missing: str
-) -> StepState:
-    model = shell_words(calibration[-1].name) if calibration else "calibration.mcap"
-    command = f"ipsys live --rig lab.toml --model-from {model} -o live.mcap --web"
+def _live_step(logs: tuple[LogFacts, ...], fit: FitFacts | None, missing: str) -> StepState:
+    log, model = (shell_words(fit.log.name), fit.model) if fit else ("calibration.mcap", "joint")
+    command = f"ipsys live --rig lab.toml --model-from {log} --model {model} -o live.mcap --web"
     tracked = [log.path.name for log in logs if log.tracked]
     if tracked:
         status, text = Status.DONE, f"tracked in {', '.join(tracked)}"
     elif missing or fit is None:
-        status, text = Status.WAITS, missing or "first fit a model"
+        status, text = Status.WAITS, missing or "first calibrate the lab"
     else:
         status, text = Status.READY, ""
     return StepState("live", "Live view", command, status, text)

@@ -5,17 +5,21 @@ An IpsysError says which fault the rig, a camera, a log or a sheet has.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from ipsys_log.api import python_api as api
 from ipsys_log.app.first_day.board import BoardEntry, BoardSearch
 from ipsys_log.app.first_day.camera_choice import set_calibration
+from ipsys_log.app.first_day.drive import DriveCoverage
 from ipsys_log.app.first_day.jobs import Job
-from ipsys_log.app.first_day.lab_folder import ALIGNMENT_LOG, LabFolder
+from ipsys_log.app.first_day.lab_folder import ALIGNMENT_LOG, DRIVE_LOG, LabFolder
+from ipsys_log.app.first_day.points_plan import choose_rows
 from ipsys_log.app.report.calibration import calibration_lines
 from ipsys_log.app.report.files import write_files
 from ipsys_log.calibration.calibrate import CalibrationResult
@@ -32,18 +36,27 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.calibration_files import calibration_text
 from ipsys_log.exchange.lab_files import load_cameras, read_lab
 from ipsys_log.live_runs import pipeline
+from ipsys_log.live_runs.survey.checks import baseline_names, read_baseline
 from ipsys_log.live_runs.survey.entry import check_references
-from ipsys_log.live_runs.survey.from_log import open_finished_log
+from ipsys_log.live_runs.survey.from_log import FinishedLog, open_finished_log
+from ipsys_log.live_runs.survey.lab_calibration import LabCalibration, describe_lab
 from ipsys_log.live_runs.survey.live import LiveScene
 from ipsys_log.live_runs.survey.sheet import add_sheet, check_sheet
+from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedImage, CompressedVideo, Message, Model
+from ipsys_log.messages.channels import RIG
 from ipsys_log.sinks.sink import Sink
 from ipsys_log.sinks.streams.opening import Stream, check_streams, open_live_streams, settings_of_rig
-from ipsys_log.units import NS_PER_S
+from ipsys_log.statistics.calibration_points import active_measurements
+from ipsys_log.units import CM_PER_M, NS_PER_S
 
 _LAST_STAGE = "camera-frame"
 # Durations of recordings, by the time stamps of the frames, and the least number of frames of each camera.
 _SHEET_S, _ALIGN_S, _LEAST_FRAMES = 5.0, 3.0, 20
+
+
+# Wanted mean error of each camera.
+GOAL_M = 0.003
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,43 +117,99 @@ def calibrate(folder: LabFolder, search: BoardSearch, pictures: Path, entry: Boa
         job.say(line)
 
 
-def measure_sheet(folder: LabFolder, sheet: Path, job: Job) -> None:
-    """Record stationary markers, and append the tape measurements of a sheet.
+def drive(
+    folder: LabFolder, show: Callable[[DriveCoverage], AbstractContextManager[object]], job: Job
+) -> None:
+    """Record a drive until the job is stopped (``ipsys record``).
+
+    Parameters
+    ----------
+    show : shows the covered parts of the images.
+    """
+    with _new_log(folder, DRIVE_LOG) as log, _open_cameras(folder, job) as (opened, monitor):
+        check_start(opened.rig, opened.lab.names, opened.lenses, Request(), "detect")
+        with closing(DriveCoverage(opened.rig, opened.lab.names)) as coverage, show(coverage):
+            job.say("drive through all images")
+            pipeline.record(opened.cameras, opened.settings, log, [monitor, coverage])
+
+
+def measure_sheet(folder: LabFolder, sheet: Path, count: int | None, job: Job) -> None:
+    """Record stationary markers, and append tape measurements of a sheet, and the distance AB.
 
     This is ``ipsys record``, and then ``ipsys measure LOG --csv SHEET``.
+
+    Parameters
+    ----------
+    count : number of rows, spread over the floor, without those near to a measured point; None: all rows.
     """
     with _new_log(folder, "calibration") as log:
         _record(folder, job, log, _SHEET_S)
         if job.is_stopped():
             return
         check_sheet(sheet, log, Request())
-        with open_finished_log(log, Request(), job.progress, job.say) as scene:
-            for remark in add_sheet(scene, sheet):
+        with open_finished_log(log, Request(), job.progress, job.say) as scene, TemporaryDirectory() as made:
+            chosen = sheet
+            if count is not None:
+                chosen = Path(made) / sheet.name
+                done_m = [place_m for one in folder.logs() for place_m in one.places_m]
+                chosen.write_text(choose_rows(sheet, scene.rig, done_m, count), encoding="utf-8")
+            for remark in add_sheet(scene, chosen):
                 job.say(remark)
+            _add_baseline(scene)
+
+
+def _add_baseline(scene: FinishedLog) -> None:
+    """Append the distance AB as the tape of the simulated lab reads it, in whole mm, if it counts."""
+    rig = scene.rig
+    if rig.ab_sigma_m is None:
+        return
+    first, second = (next(p for p in rig.reference_points if p.name == name) for name in baseline_names(rig))
+    apart_cm = CM_PER_M * math.hypot(second.x_m - first.x_m, second.y_m - first.y_m)
+    scene.add([read_baseline(f"{apart_cm:.1f}", rig, scene.history(), scene.start_ns)])
 
 
 def measure(folder: LabFolder, show: Callable[[LiveScene], AbstractContextManager[object]], job: Job) -> None:
     """Measure points with live cameras until the job is stopped (``ipsys record --measure --points-only``).
 
+    Then the markers are detected, so that the points of each camera can be counted.
+
     Parameters
     ----------
     show : shows the measuring page of a scene.
     """
-    with _new_log(folder, "calibration") as log, _open_cameras(folder, job) as (opened, monitor):
-        check_references(opened.rig)
-        check_start(opened.rig, opened.lab.names, opened.lenses, Request(), _LAST_STAGE)
-        scene = LiveScene(opened.rig, None, opened.cameras.states, opened.cameras.save)
-        with show(scene):
-            job.say("open the measuring page")
-            pipeline.measure(opened.cameras, opened.settings, log, Request(), [scene, monitor])
+    with _new_log(folder, "calibration") as log:
+        with _open_cameras(folder, job) as (opened, monitor):
+            check_references(opened.rig)
+            check_start(opened.rig, opened.lab.names, opened.lenses, Request(), _LAST_STAGE)
+            scene = LiveScene(opened.rig, None, opened.cameras.states, opened.cameras.save)
+            with show(scene):
+                job.say("open the measuring page")
+                pipeline.measure(opened.cameras, opened.settings, log, Request(), [scene, monitor])
+        if active_measurements(scene.history()):
+            api.replay(log, until=_LAST_STAGE, progress=job.note_progress, say=job.say)
 
 
-def fit_and_evaluate(folder: LabFolder, job: Job) -> None:
-    """Fit the model to all calibration points of the folder, and evaluate it (``ipsys replay``).
+def calibrate_lab(folder: LabFolder, job: Job) -> LabCalibration | None:
+    """Fit a model to all drives and calibration points of the folder; return its expected errors.
 
-    A stop keeps the finished runs; the logs get no part of a run.
+    With a drive, this is ``ipsys calibrate-lab``. Without one, it is ``ipsys replay --model poly``, which
+    evaluates the model, and returns None. A stop keeps the finished runs; the logs get no part of a run.
     """
-    api.replay(*folder.calibration_logs(), progress=job.progress, say=job.say)
+    logs = folder.calibration_logs()
+    if not folder.has_drive():
+        api.replay(*logs, models=("poly",), progress=job.progress, say=job.say)
+        return None
+    api.replay(*logs, models=("joint",), until="fit", progress=job.progress, say=job.say)
+    fit = folder.fit()
+    if fit is None:
+        raise IpsysError("the logs have no calibration; calibrate again")
+    with Session(logs) as session:
+        rig = session.payloads(session.topics(RIG))[-1]
+        lenses = {camera: session.payloads([topic])[-1] for camera, topic in session.calibrations.items()}
+        return describe_lab(
+            session, fit.run, rig, lenses, (None, {}), "train", GOAL_M,
+            lambda done, total: job.progress("describe", done, total),
+        )  # fmt: skip
 
 
 def track(folder: LabFolder, show: Callable[[LiveRecording], AbstractContextManager[Sink]], job: Job) -> None:
@@ -150,7 +219,10 @@ def track(folder: LabFolder, show: Callable[[LiveRecording], AbstractContextMana
     ----------
     show : shows the dashboard of a recording; its value gets the recorded messages.
     """
-    request = Request(model_from=folder.calibration_logs()[-1])
+    fit = folder.fit()
+    if fit is None:
+        raise IpsysError("the folder has no model; calibrate the lab first")
+    request = Request(model_from=fit.log, models=(fit.model,))
     with _new_log(folder, "live") as log, _open_cameras(folder, job) as (opened, monitor):
         for line in check_start(opened.rig, opened.lab.names, opened.lenses, request, None):
             job.say(line)

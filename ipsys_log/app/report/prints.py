@@ -22,6 +22,8 @@ from ipsys_log.vision.markers import cell_outlines, white_cells
 
 # White margin around a chessboard or a ChArUco board, in squares; white margin around a marker, in cells.
 _BOARD_MARGIN, _MARKER_MARGIN = 0.5, 1.0
+# A marker of this side fits on A4 and on Letter, and is that of the example of a rig.
+_USUAL_LENGTH_M = 0.14
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,6 +63,9 @@ def marker_print(dictionary: str, marker_id: int, length_m: float, robot: str | 
 def rig_prints(rig: Rig, ids: Sequence[int] | None = None, length_m: float | None = None) -> list[Print]:
     """Return the prints of the markers of a rig, or of some ids, each with its own side length.
 
+    The simulated lab draws its markers itself: those of its robots are printed to try, at most as large as A4
+    can hold.
+
     Parameters
     ----------
     rig : rig with the dictionary, the markers and their side lengths.
@@ -69,6 +74,9 @@ def rig_prints(rig: Rig, ids: Sequence[int] | None = None, length_m: float | Non
     """
     names = {marker.id: marker.robot for marker in rig.markers}
     names |= {marker.id: "reference" for marker in rig.reference_markers}
+    if ids is None and rig.is_simulated:
+        ids = [marker.id for marker in rig.markers if marker.robot]
+        length_m = length_m or min(rig.marker_length_m, _USUAL_LENGTH_M)
     prints = []
     for marker_id in list(names) if ids is None else ids:
         side_m = length_m or rig.length_of(marker_id)

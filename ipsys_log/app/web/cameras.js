@@ -56,7 +56,12 @@ function fill(made, camera, view, whole) {
     "data-marker": one.id,
   });
   const picture = camera.picture ? [element("image", { href: camera.picture, width, height })] : [];
-  svg.replaceChildren(...picture, ...camera.markers.map(outline));
+  const middle = (values) => (Math.max(...values) + Math.min(...values)) / 2;
+  const idOf = (one) => element("text", {
+    x: middle(one.corners_px.map((corner) => corner[0])), y: middle(one.corners_px.map((corner) => corner[1])),
+    "font-size": svg.viewBox.baseVal.width / (close ? 9 : 22),
+  }, String(one.id));
+  svg.replaceChildren(...picture, ...camera.markers.map(outline), ...camera.markers.map(idOf));
   name.replaceChildren(camera.name, make("small", {}, what));
   name.style.borderColor = camera.colour;
 }

@@ -119,7 +119,8 @@ function show(answer) {
     place.textContent = wrong.find((fault) => fault.field === field)?.text ?? "";
     part.classList.toggle("bad", Boolean(place.textContent));
   }
-  const rest = wrong.filter((fault) => !$(`fault-${fault.field}`) && (fault.field || any) && fault.field !== "marker");
+  const isUnseen = $("marker").value && !view.visible?.includes(Number($("marker").value));
+  const rest = wrong.filter((fault) => !$(`fault-${fault.field}`) && (fault.field || any) && (fault.field !== "marker" || isUnseen));
   $("verdict").replaceChildren(
     ...rest.map((fault) => make("p", { className: "bad" }, upper(fault.text))),
     ...verdict(answer),
@@ -201,18 +202,14 @@ async function look() {
 
 // A tap on a marker in an image chooses it.
 const choose = guarded(async (id) => {
-  if (![...$("marker").options].some((option) => option.value === String(id))) return;
   $("marker").value = String(id);
   await look();
   soon();
 });
 
 function offerMarkers() {
-  const chosen = $("marker").value, ids = [...new Set([...view.visible.map(String), ...(chosen ? [chosen] : [])])];
-  if ([...$("marker").options].slice(1).map((o) => o.value).join() === ids.join()) return;
-  const any = make("option", { value: "" }, view.visible.length === 1 ? `${view.visible[0]}, the only visible marker` : "choose");
-  $("marker").replaceChildren(any, ...ids.map((id) => make("option", { value: id }, id)));
-  $("marker").value = chosen;
+  const [only, ...others] = view.visible;
+  $("marker").placeholder = only !== undefined && !others.length ? `${only}, the only visible marker` : "tap it, or type its id";
 }
 
 // --- calibration points -----------------------------------------------------------------------

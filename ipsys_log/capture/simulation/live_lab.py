@@ -150,6 +150,9 @@ _WIDTH, _HEIGHT = 1920, 1080
 # smaller images.
 _NARROWEST_PX = 50.0
 
+# The reference points of the simulated lab are exact: the distance AB shows the scale of its tape.
+_AB_SIGMA_M = 0.0005
+
 _planning = Lock()
 
 
@@ -252,7 +255,8 @@ def live_rig(settings: LabSettings) -> Rig:
     rig = build_rig(settings)
     stationary = plan_live_lab(settings).stationary
     still = (RigMarker(pose.marker_id, height_m=pose.z_m) for pose in stationary)
-    return replace(rig, cameras=live_cameras(settings), markers=(*rig.markers, *still))
+    markers = (*rig.markers, *still)
+    return replace(rig, cameras=live_cameras(settings), markers=markers, ab_sigma_m=_AB_SIGMA_M)
 
 
 def tape_sheet(stationary: Sequence[SimulatedPose]) -> str:

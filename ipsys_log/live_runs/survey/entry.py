@@ -9,6 +9,7 @@ import numpy as np
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Distance, ReferencePoint, Rig
+from ipsys_log.plain_text import join_names
 from ipsys_log.units import CM_PER_M
 from ipsys_log.vision.trilateration import SIDES, are_collinear
 
@@ -156,7 +157,7 @@ def _marker(text: str, rig: Rig, faults: list[Fault]) -> int | None:
         faults.append(Fault("marker", message))
         return None
     if not rig.knows(int(text)):
-        ids = ", ".join(str(marker.id) for marker in rig.markers)
+        ids = join_names([str(marker.id) for marker in rig.markers])
         faults.append(Fault("marker", f"marker {text} is not in the rig (it has {ids})"))
         return None
     return int(text)

@@ -336,7 +336,8 @@ def _corners(rig: Rig, places_m: Sequence[Array]) -> tuple[Array, Array]:
 
 def _usual_marker(rig: Rig, fit: JointFit) -> tuple[float, float]:
     """Return the height and the side of the robots' markers."""
-    carried_m = [height for marker in rig.markers if (height := rig.height_of(marker.id)) is not None]
+    # A marker for calibration points lies on the floor: no robot carries it.
+    carried_m = [height for marker in rig.markers if (height := rig.height_of(marker.id))]
     measured_m = [point.height_m for point in fit.observations.points if point.height_m is not None]
     height_m = rig.marker_height_m
     if height_m is None:

@@ -1,10 +1,10 @@
 // The content of each step. The server decides what can be done; the page only asks.
 import { change, choice, field, markFault, showFaults } from "./fields.js";
 import { make } from "./make.js";
-import { alignedImage, cameraImage, floorSketch } from "./pictures.js";
+import { alignedImage, cameraImage, floorMap, floorSketch } from "./pictures.js";
 
 // More cards than these are compact, so that a page of them can be surveyed.
-const MOST_LARGE = 6;
+const MOST_LARGE = 6, MOST_HEIGHTS = 30;
 const cards = (made) => make("div", { className: `cards${made.length > MOST_LARGE ? " many" : ""}` }, ...made);
 
 const cameraId = (key) => `camera-${key.replace(/[^a-z0-9]/gi, (sign) => `_${sign.charCodeAt(0)}`)}`;
@@ -19,7 +19,8 @@ function report(state) {
 export function shownPart(name, state) {
   const parts = {
     rig: state.rig, cameras: [state.cameras, state.address], intrinsics: [state.intrinsics, state.board !== null, report(state)], alignment: state.alignment,
-    points: [state.points, state.measured_now], accuracy: [state.accuracy, state.points], live: state.tracked,
+    drive: [state.drive.logs, state.drive.views !== null], points: [state.points, state.map, state.measured_now],
+    accuracy: [state.accuracy, state.lab, state.map, state.points], live: state.tracked,
   };
   const busy = state.job && !state.job.ended ? state.job.action : null;
   return JSON.stringify([name, parts[name], state.steps, busy, state.pages, state.may_change, state.faults]);
@@ -28,7 +29,7 @@ export function shownPart(name, state) {
 export function panel(name, state, act) {
   const step = state.steps.find((one) => one.name === name);
   const number = state.steps.indexOf(step) + 1, later = state.steps.slice(number);
-  const content = { rig, cameras, intrinsics, alignment, points, accuracy, live }[name](state, act, step);
+  const content = { rig, cameras, intrinsics, alignment, drive, points, accuracy, live }[name](state, act, step);
   // Finished steps are skipped: a simulated lab has its cameras and their intrinsics.
   const following = later.find((one) => one.status === "ready") ?? later[0];
   const onward = step.status === "done" && following
@@ -56,7 +57,12 @@ const sentence = (text) => `${text}.`.replace(/\.\.$/, ".");
 
 function button(text, work, id, more = {}) {
   const made = make("button", { type: "button", textContent: text, ...(id ? { id } : {}), ...more });
-  made.addEventListener("click", work);
+  // A second tap does nothing while the server works on the first one.
+  made.addEventListener("click", async () => {
+    if (made.ariaBusy === "true") return;
+    made.ariaBusy = "true";
+    try { await work(); } finally { made.ariaBusy = "false"; }
+  });
   return made;
 }
 
@@ -71,13 +77,14 @@ function lines(rows) {
   return rows.length ? [make("ul", { className: "lines" }, ...rows.map(([kind, text]) => make("li", { className: kind, textContent: text })))] : [];
 }
 
-// A button that downloads a PDF for a printer; texts: the typed fields.
+// A button that downloads a PDF for a printer, and the paper; texts: the typed fields.
 function printer(name, text, act, texts = () => ({})) {
-  return button(text, () => act(async () => {
-    const answer = await fetch(`print/${name}.pdf?${new URLSearchParams(texts())}`);
+  const paper = make("select", { id: `paper-${name}`, ariaLabel: "Paper" }, ...["A4", "Letter", "A3"].map((one) => make("option", {}, one)));
+  return [button(text, () => act(async () => {
+    const answer = await fetch(`print/${name}.pdf?${new URLSearchParams({ ...texts(), paper: paper.value })}`);
     if (!answer.ok) throw new Error((await answer.json()).error);
     make("a", { href: URL.createObjectURL(await answer.blob()), download: `${name}.pdf` }).click();
-  }), `print-${name}`);
+  }), `print-${name}`), paper];
 }
 
 function submit(form, state, act, isMain, work, { id = "save", text = "Save", disabled = false } = {}) {
@@ -90,32 +97,44 @@ function submit(form, state, act, isMain, work, { id = "save", text = "Save", di
 function rig(state, act, step) {
   const { values, labels, dictionaries, exists, name } = state.rig;
   if (exists && name === null) return lines([["bad", "Correct lab.toml with a text editor; this page sees the new file. Or move it away to begin again."]]);
-  const form = make("form", { className: "grid" });
+  const form = make("form", { className: "grid" }), heights = make("div", { id: "heights", className: "grid" });
   let pair = form;
   for (const [key, label] of Object.entries(labels)) {
-    const made = field(key, label, values[key], key.endsWith("_m") ? { inputMode: "decimal" } : {});
+    const offered = [...new Set([...dictionaries, values[key]])];
+    const made = key === "dictionary" ? choice(key, label, values[key], offered)
+      : field(key, label, values[key], key.endsWith("_m") ? { inputMode: "decimal" } : {});
     // The two coordinates of a point are side by side.
     if (/(width|x)_m$/.test(key)) form.append((pair = make("div", { className: "pair" }, made)));
     else if (/(depth|y)_m$/.test(key)) pair.append(made);
     else form.append(made);
-    if (key !== "dictionary") continue;
-    made.querySelector("input").setAttribute("list", "dictionaries");
-    made.append(make("datalist", { id: "dictionaries" }, ...dictionaries.map((name) => make("option", { value: name }))));
+    if (key === "point_marker") form.append(make("details", { className: "single" }, make("summary", { textContent: "Markers at other heights" }), heights));
   }
+  const input = (key) => form.querySelector(`#${key}`), number = (key) => Number((input(key)?.value ?? "").replace(",", "."));
+  // One height for each typed id; a height that is there stays.
+  const offerHeights = () => {
+    const ids = [...new Set(input("robots").value.match(/\d{1,4}/g) ?? [])].slice(0, MOST_HEIGHTS).map(Number);
+    heights.replaceChildren(...ids.map((id) => input(`height_${id}`)?.parentElement
+      ?? field(`height_${id}`, `Height of marker ${id}, in m`, values[`height_${id}`] ?? "", { inputMode: "decimal" })));
+  };
+  offerHeights();
   submit(form, state, act, step.status !== "done", async () => {
-    const typed = Object.fromEntries(Object.keys(labels).map((key) => [key, document.getElementById(key).value]));
+    const typed = Object.fromEntries([...form.querySelectorAll("input, select")].map((one) => [one.id, one.value]));
     showFaults(form, await change("rig", { values: typed }), (key) => key);
   });
-  const sketch = make("div", { id: "sketch" }), show = () => {
-    const numbers = Object.fromEntries(Object.keys(labels).map((key) => [key, Number((form.querySelector(`#${key}`)?.value ?? "").replace(",", "."))]));
-    sketch.replaceChildren(...floorSketch(numbers));
+  const sketch = make("div", { id: "sketch" }), show = ({ target } = {}) => {
+    if (target === input("robots")) offerHeights();
+    const apart = Math.hypot(number("second_x_m") - number("first_x_m"), number("second_y_m") - number("first_y_m"));
+    // Coordinates give the distance AB; a typed distance moves B.
+    if (target && /_[xy]_m$/.test(target.id) && apart) input("ab_m").value = String(Number(apart.toFixed(4)));
+    sketch.replaceChildren(...floorSketch(Object.fromEntries(Object.keys(labels).map((key) => [key, number(key)]))));
   };
   form.addEventListener("input", show);
   show();
   const help = [make("div", { className: "help" }, make("div", {},
     make("p", { textContent: "Measure the side of the black square of a printed marker, without its white margin. With an error of 2 % in it, all heights have an error of 2 %." }),
-    make("p", { textContent: "The reference points A and B are two points on the floor that you can find again. You measure from them with a tape later: choose them some metres apart. x is to the right, y away from you." })), sketch)];
-  if (exists) return [...help, form, ...lines(state.rig.warnings.map((text) => ["warn", sentence(text)])), make("div", { className: "actions" }, printer("markers", "Markers to print (PDF)", act))];
+    make("p", { textContent: "The reference points A and B are two points on the floor that you can find again. You measure from them with a tape later: choose them some metres apart. x is to the right, y away from you. The distance from A to B, read with the tape, moves B." }),
+    make("p", { textContent: "Measure the height of the robots' markers with a ruler: the calibration with a drive needs it." })), sketch)];
+  if (exists) return [...help, form, ...lines(state.rig.warnings.map((text) => ["warn", sentence(text)])), make("div", { className: "actions" }, ...printer("markers", "Markers to print (PDF)", act))];
   const simulated = button("Use the simulated lab", () => act(() => change("simulate")), "simulate", { disabled: !state.may_change });
   return [
     make("h3", { textContent: "Without cameras" }),
@@ -204,7 +223,7 @@ function intrinsics(state, act) {
     ...shown,
     make("p", { textContent: "The intrinsics describe the lens of a camera. Pictures of a chessboard determine them." }),
     make("p", { textContent: "Print the chessboard, and glue it on a flat plate. Press Calibrate, move the board through the whole image, and tilt it to all sides. Pictures are taken by themselves. Stop ends early and calibrates with the pictures so far. A board of 7 x 5 squares has 6x4 inner corners." }),
-    make("div", { className: "actions" }, printer("board", "Board to print (PDF)", act, typed)),
+    make("div", { className: "actions" }, ...printer("board", "Board to print (PDF)", act, typed)),
     form,
     ...(state.board ? [] : [listed]),
     ...lines(report(state).map((text, n) => [n ? "" : "strong", text])),
@@ -242,23 +261,50 @@ const finish = (text, state, act) => button(text, () => act(() => change("stop")
 
 const opener = (id, page, text) => make("a", { id, className: "button main", href: `${page}/`, target: "_blank", textContent: text });
 
-function points(state, act) {
-  const { sheet, logs } = state.points;
-  const count = state.measured_now;
+const count = (number, noun) => `${number} ${noun}${number === 1 ? "" : "s"}`;
+
+function table(rows, heads = []) {
+  const cells = (row, kind) => make("tr", {}, ...row.map((text) => make(kind, {}, text)));
+  return make("div", { className: "wide", tabIndex: 0 }, make("table", {}, make("thead", {}, ...(heads.length ? [cells(heads, "th")] : [])), make("tbody", {}, ...rows.map((row) => cells(row, "td")))));
+}
+
+function drive(state, act, step) {
+  const { views, logs } = state.drive;
   const parts = [
-    paragraph("Put a marker of a robot on the floor. Measure its distances from the two reference points with a tape, and type them on the measuring page. Repeat this over the whole floor, also near its edges; put the marker on a box for some points."),
-    paragraph("15 to 20 points in the view of each camera give good results."),
+    paragraph("Drive a robot, or carry its marker at its height, through all images for two minutes: in curves, through the overlaps, out to the edges. The drive replaces most work with the tape."),
+    make("div", { className: "actions" }, views ? finish("Finish the drive", state, act) : starter(logs.length ? "Drive again" : "Start the drive", "drive", state, act, step.status !== "done")),
+  ];
+  if (views) parts.push(make("p", { id: "drive-seconds" }), make("div", { id: "drive-views", className: "cards" }));
+  if (logs.length) parts.push(table(logs.map(([name, seconds]) => [make("code", { textContent: name }), `${seconds} s`])));
+  parts.push(make("details", {}, make("summary", { textContent: "Without a drive: the tape alone" }),
+    paragraph(`Skip this step, and measure more points: enough are ${state.points.enough}.`)));
+  return parts;
+}
+
+function points(state, act, step) {
+  const { sheet, logs, enough } = state.points;
+  const now = state.measured_now, isFirst = step.status !== "done";
+  const parts = [
+    paragraph(`Put a marker that no robot carries on the floor, near a number on the map. Measure its distances from A and B with a tape, and type them on the measuring page. Enough are ${enough}; eight points after a drive are better.`),
   ];
   const actions = make("div", { className: "actions" });
   if (state.pages.measure) actions.append(opener("open-measure", "measure", "Open the measuring page"), finish("Finish measuring", state, act));
-  else actions.append(starter("Start measuring", "measure", state, act, !sheet && logs.length === 0));
-  if (sheet && !state.pages.measure) actions.append(starter(`Use the tape measurements in ${sheet}`, "sheet", state, act, logs.length === 0));
+  else {
+    if (sheet) actions.append(starter("Measure four points with the simulated tape", "sheet", state, act, isFirst));
+    actions.append(starter("Start measuring", "measure", state, act, isFirst && !sheet));
+  }
   parts.push(actions);
-  if (count !== null) parts.push(paragraph(`${count} ${count === 1 ? "point" : "points"} measured in this log so far.`));
+  if (now !== null) parts.push(paragraph(`${count(now, "point")} measured in this log so far.`));
+  if (state.map) parts.push(floorMap(state.map, null));
   if (logs.length) {
-    parts.push(make("table", {}, make("tbody", {}, ...logs.map(([name, number]) =>
-      make("tr", {}, make("td", {}, make("code", { textContent: name })), make("td", { textContent: `${number} points` }))))));
-    parts.push(paragraph("The fit uses all these logs. Measuring again writes a new log."));
+    const cameras = [...new Set(logs.flatMap(([, , seen]) => Object.keys(seen)))].sort();
+    parts.push(table(logs.map(([name, number, seen]) => [make("code", { textContent: name }), String(number), ...cameras.map((camera) => String(seen[camera] ?? "-"))]),
+      ["log", "points", ...cameras]));
+    parts.push(paragraph("The calibration uses all these logs. Measuring again writes a new log."));
+  }
+  if (sheet && !state.pages.measure) {
+    parts.push(make("details", {}, make("summary", { textContent: "Without a drive: the tape alone" }),
+      make("div", { className: "actions" }, starter(`Measure all points in ${sheet}`, "sheet-all", state, act, false))));
   }
   return parts;
 }
@@ -271,27 +317,43 @@ function outlier(one, several, state, act) {
   return make("li", { className: "warn outlier" }, make("span", { textContent: `${name}, error ${one.error_cm.toFixed(1)} cm: ${text}.` }), exclude);
 }
 
+// The answer of a calibration with a drive: is it enough, and what to add.
+function lab(state) {
+  const { headline: [answer, ...faults], enough, advice, title, columns, rows, gap, notes } = state.lab;
+  const leads = [["drive", "Drive there"], ["points", "Measure points"]];
+  return [
+    ...lines([[enough ? "good" : "warn", answer], ...faults.map((text) => ["warn", text.trim()]), ...advice.map((text) => ["", text])]),
+    ...(enough ? [] : [make("div", { className: "actions" }, ...leads.map(([name, text]) => button(text, () => { location.hash = name; }, `to-${name}`)))]),
+    ...(state.map ? [floorMap(state.map, gap)] : []),
+    make("details", {}, make("summary", { textContent: "Details of each camera" }), paragraph(sentence(title)), table(rows, columns), ...lines(notes.map((text) => ["", text]))),
+  ];
+}
+
 function accuracy(state, act, step) {
   const fit = state.accuracy;
   const parts = [
-    paragraph("The fit computes a model from the measured points: positions in the images become positions on the floor. Then it tells the error of the positions."),
-    make("div", { className: "actions" }, starter(fit ? "Fit again" : "Fit and evaluate", "replay", state, act, step.status !== "done")),
+    paragraph(state.drive.logs.length
+      ? "The calibration computes all cameras together, from the drive and the points. It tells the expected error over the floor, and whether it is enough."
+      : "Without a drive, the model of each camera comes from its points alone."),
+    make("div", { className: "actions" }, starter(fit ? "Calibrate again" : "Calibrate", "calibrate-lab", state, act, step.status !== "done")),
   ];
+  if (state.lab) parts.push(...lab(state));
+  else if (fit && !fit.figure) parts.push(paragraph("Calibrate again to see the expected errors."));
   if (!fit) return parts;
   if (fit.figure) parts.push(make("p", { className: "figure", textContent: fit.figure }));
   if (fit.outliers.length) {
     const several = new Set(state.points.logs.map(([name]) => name)).size > 1;
     parts.push(make("h3", { textContent: fit.outliers.length === 1 ? "A point contradicts the others" : `${fit.outliers.length} points contradict the others` }),
-      paragraph("Measure it again in step 5, and exclude it here. An excluded point stays in the log."),
+      paragraph("Measure it again, and exclude it here. An excluded point stays in the log."),
       make("ul", { className: "lines" }, ...fit.outliers.map((one) => outlier(one, several, state, act))));
   }
-  parts.push(make("details", {}, make("summary", { textContent: "Details" }), ...lines(fit.answer.map((text) => ["", text]))));
+  if (fit.answer.length) parts.push(make("details", {}, make("summary", { textContent: "Details" }), ...lines(fit.answer.map((text) => ["", text]))));
   return parts;
 }
 
 function live(state, act, step) {
   const parts = [
-    paragraph("The robots are tracked and recorded. The dashboard shows them; other devices can open it, too, if ipsys setup was started with --host 0.0.0.0."),
+    make("p", {}, "The robots are tracked and recorded. The dashboard shows them. Other devices can open it, too, after ", command("ipsys setup --host 0.0.0.0")),
     make("div", { className: "actions" }, ...(state.pages.live
       ? [opener("open-live", "live", "Open the dashboard"), finish("Finish the recording", state, act)]
       : [starter("Start the live view", "live", state, act, step.status !== "done")])),

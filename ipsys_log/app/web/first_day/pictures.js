@@ -58,3 +58,33 @@ export function floorSketch(typed) {
   for (const [name, x, y] of points) svg.append(element("circle", { cx: x, cy: depth - y, r: unit / 2 }), text(x + unit, y + unit / 2, name));
   return [svg];
 }
+
+// The image of each camera during a drive; the cells in which a robot was are marked.
+export function driveImages(views) {
+  return views.map(({ camera, picture, cells, share }) => {
+    const text = `${camera}: ${Math.round(share * 100)} % of the image covered`;
+    const [width, height] = [16, 9], [w, h] = [width / cells[0].length, height / cells.length];
+    const svg = element("svg", { viewBox: `0 0 ${width} ${height}`, preserveAspectRatio: "none", role: "img", "aria-label": text });
+    if (picture) svg.append(element("image", { href: picture, width, height, preserveAspectRatio: "none" }));
+    cells.forEach((row, y) => row.forEach((is, x) => { if (is) svg.append(element("rect", { x: x * w, y: y * h, width: w, height: h, class: "covered" })); }));
+    return make("div", { className: "card" }, make("div", { className: "image" }, svg), make("div", {}, make("p", { textContent: text })));
+  });
+}
+
+// The floor from above: A and B, measured points, numbered places for further ones, and the part to drive through.
+export function floorMap({ floor: [width, depth], references, done, proposed }, gap) {
+  const unit = Math.max(width, depth) / 20;
+  const text = (x, y, content) => element("text", { x: x + unit * 0.7, y: depth - y + unit * 0.4, "font-size": unit }, content);
+  const svg = element("svg", { viewBox: `${-unit} ${-unit} ${width + 2 * unit} ${depth + 2 * unit}`, role: "img",
+    "aria-label": `The floor from above: ${done.length} measured, ${proposed.length} proposed` });
+  svg.append(element("rect", { width, height: depth, class: "ground" }));
+  if (gap) {
+    const [[x0, y0], [x1, y1]] = gap;
+    svg.append(element("rect", { x: x0, y: depth - y1, width: x1 - x0, height: y1 - y0, class: "gap" }), text(x0, (y0 + y1) / 2, "drive here"));
+  }
+  for (const { name, x_m: x, y_m: y } of references) svg.append(element("rect", { x: x - unit / 3, y: depth - y - unit / 3, width: unit / 1.5, height: unit / 1.5, class: "reference" }), text(x, y, name));
+  for (const [x, y] of done) svg.append(element("circle", { cx: x, cy: depth - y, r: unit / 2.5, class: "done" }));
+  proposed.forEach(({ point_m: [x, y] }, n) => svg.append(element("circle", { cx: x, cy: depth - y, r: unit / 2, class: "proposed" }), text(x, y, String(n + 1))));
+  const rows = proposed.map(({ tapes }) => make("li", { textContent: Object.entries(tapes).map(([name, cm]) => `${name} ${cm} cm`).join(", ") }));
+  return make("div", { className: "map" }, svg, ...(rows.length ? [make("div", {}, make("p", { textContent: "Points to measure, at about these distances:" }), make("ol", {}, ...rows))] : []));
+}

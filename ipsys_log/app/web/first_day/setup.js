@@ -2,7 +2,7 @@
 import { change, seat } from "./fields.js";
 import { make } from "./make.js";
 import { panel, shownPart } from "./panels.js";
-import { boardImage } from "./pictures.js";
+import { boardImage, driveImages } from "./pictures.js";
 
 const $ = (id) => document.getElementById(id);
 const EVERY_MS = 1000, PATIENCE_MS = 15000;
@@ -24,6 +24,13 @@ function tell(text) {
 async function act(work) {
   tell("");
   told = state.job?.error ?? "";
+  // The server may need some seconds, before a job is known.
+  if (!state.job || state.job.ended) {
+    $("job").hidden = false;
+    $("stop").hidden = true;
+    $("job-text").textContent = $("job-text").dataset.said = "Working ...";
+    $("job-progress").removeAttribute("value");
+  }
   try { await work(); } catch (error) { tell(error.message); }
   await read();
 }
@@ -98,9 +105,9 @@ function drawJob() {
 // Show who operates. Without an operator, the first device that changes something operates.
 function drawOperator() {
   const { operates, isFree } = seat;
-  $("operate").hidden = false;
+  $("operate").hidden = state.may_operate && isFree;
   const text = !state.may_operate ? "This device only views." : operates ? "This device operates; others only view."
-    : isFree ? "No device operates yet: the first one that changes something does." : "Another device operates; this one only views.";
+    : isFree ? "" : "Another device operates; this one only views.";
   if ($("operation").textContent !== text) $("operation").textContent = text;
   $("take").textContent = operates ? "Let others operate" : "Take over";
   $("take").hidden = !state.may_operate || isFree;
@@ -127,6 +134,7 @@ async function ask() {
 function drawLost() {
   if (!state) return;
   state.may_change = false;
+  $("operate").hidden = false;
   $("operation").textContent = "ipsys does not answer: the buttons wait. If the command has ended, start it again.";
   $("take").hidden = $("stop").hidden = true;
   drawPanel();
@@ -146,9 +154,14 @@ async function read() {
     drawOperator();
     const count = state.steps.filter((step) => step.status === "done").length;
     chip(count === state.steps.length ? "good" : "", `${count} of ${state.steps.length} done`);
-    $("folder").textContent = state.rig.name ?? state.folder;
+    $("folder").textContent = state.folder;
     choose();
     drawPanel(isBack);
+    if (state.drive.views && $("drive-views")) {
+      $("drive-views").replaceChildren(...driveImages(state.drive.views));
+      $("drive-views").dataset.seconds = state.drive.seconds;
+      $("drive-seconds").textContent = `${state.drive.seconds} s recorded. Green: a robot was in this part of the image.`;
+    }
     if (state.board) $("board-image")?.replaceChildren(...boardImage(state.board));
     drawJob();
   } catch (error) {

@@ -193,7 +193,7 @@ def test_runs_list_their_inputs(ipsys: Ipsys, replayed_lab: Path) -> None:
         "corners": "edges",
         "reset_s": "30",
         "detect": "3",
-        "edges": "2",
+        "edges": "3",
     }
     assert {row["topic"] for row in runs["detect"]["inputs"]} == {
         "/rig",

@@ -59,7 +59,7 @@ def choose_models(request: Request, paths: Sequence[LogLocation], until: Stage) 
             return Choice(request, copied or (*MODELS, *(CORNER_MODELS if has_corners(session) else ())))
         if MODEL not in until.writes and (chain := _newest_chain(complete_runs(session))):
             request = _continued(request, chain)
-            return Choice(request, request.models, f"model {request.models[0]}: that of the newest run")
+            return Choice(request, request.models, _newest_reason(session, request.models[0]))
         if copied:
             return Choice(request, copied, f"model {copied[0]}: it was copied into the log")
         return Choice(request, *_best_possible(session, request.rig))
@@ -80,9 +80,15 @@ def applied_models(request: Request) -> tuple[tuple[str, ...], str]:
     assert request.model_from is not None
     with Session([request.model_from]) as other:
         name = newest_model(other)
-        names = {run.parameters.get("model", name) for run in complete_runs(other) if writes(run, MODEL)}
-    more = f"; it also has {', '.join(sorted(names - {name}))} (--model)" if len(names) > 1 else ""
-    return (name,), f"model {name}: that of the newest run of {request.model_from.name}{more}"
+        return (name,), _newest_reason(other, name)
+
+
+def _newest_reason(session: Session, name: str) -> str:
+    """Return the line that names the newest model of a log, and the others that it has."""
+    names = {run.parameters.get("model", name) for run in complete_runs(session) if writes(run, MODEL)}
+    others = ", ".join(one for one in (*CORNER_MODELS, *reversed(MODELS)) if one in names - {name})
+    more = f"; it also has {others} (--model)" if others else ""
+    return f"model {name}: that of the newest run of {session}{more}"
 
 
 def newest_model(session: Session) -> str:

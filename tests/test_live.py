@@ -224,8 +224,8 @@ def test_failed_stage_does_not_stop_the_recording(
         assert number == 0 or stopped.wait(WAIT_LIMIT_S)
 
     def say(text: str) -> None:
-        assert "the recording continues" in text
-        stopped.set()
+        if "the recording continues" in text:
+            stopped.set()
 
     frames = sent(lab_log)
     attached = LiveCameras(cameras(*frames), playing(frames, inf, before=before), Clock(), say)

@@ -300,18 +300,12 @@ def file_identity(fd: int) -> tuple[object, object]:
     return (status.st_dev, status.st_ino), (status.st_size, status.st_mtime_ns)
 
 
-# A message about a missing log names at most so many others.
-_NAMED_LOGS = 5
-
-
 def open_for_reading(path: Path) -> int:
     """Open a file for reading; return its file descriptor, or raise a one-line `UnreadError`."""
     try:
         fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     except FileNotFoundError:
-        beside = sorted(one.name for one in path.parent.glob("*.mcap"))[:_NAMED_LOGS]
-        logs = f"; the logs in this folder: {', '.join(beside)}" if beside else ""
-        raise UnreadError(f"{path} does not exist{logs}") from None
+        raise UnreadError(f"{path} does not exist") from None
     except OSError as error:
         raise UnreadError(f"{path} cannot be opened: {error.strerror}") from None
     if not stat.S_ISREG(os.fstat(fd).st_mode):

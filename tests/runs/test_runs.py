@@ -136,7 +136,7 @@ def test_run_contains_only_consistent_results(ipsys: Ipsys, replayed: Path, tmp_
         withdrawal = replace(first, timestamp=end_ns, id="w", withdraws=first.id, splits=())
     with LogWriter.append(replayed) as writer:
         write_messages(writer, [Message("/measurements", end_ns + 1, end_ns, withdrawal)])
-    again = runs_of(ipsys, "replay", replayed)
+    again = runs_of(ipsys, "replay", replayed, "--model", "poly")
     assert {again[stage] for stage in ("fit", "evaluate", "locate", "fuse")} == {("poly_3", True)}
 
 

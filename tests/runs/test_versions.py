@@ -213,7 +213,7 @@ def test_run_without_its_inputs_is_not_repeatable(ipsys: Ipsys, tmp_path: Path) 
     first = states(ipsys, log)
     assert first
     assert {row["state"] for row in first.values()} == {"not repeatable"}
-    assert made(ipsys, log)["fuse"] == ("poly", True)
+    assert made(ipsys, log, "--model", "poly")["fuse"] == ("poly", True)
     assert states(ipsys, log)["poly", "fuse"]["state"] == "current"
     done = ipsys("verify", log)
     assert (done.code, "detect is not verified: its input /cameras/" in done.err) == (0, True)

@@ -110,7 +110,7 @@ def test_unknown_point_names_the_points_of_the_log(ipsys: Ipsys, fitted: Path) -
     assert (done.code, done.out) == (1, "")
     assert f"has no calibration point 'p999'; it has {names[0]}, {names[1]}" in done.err.replace("\n", " ")
     empty = ipsys("exclude", fitted, names[0], "--reason", "  ")
-    assert (empty.code, empty.err.startswith("ipsys: --reason: is empty")) == (1, True)
+    assert (empty.code, empty.err.startswith("ipsys: --reason: is missing")) == (1, True)
     assert fitted.read_bytes() == before
 
 

@@ -164,13 +164,23 @@ _OTHER_FILES = (
 )
 
 
+# A message about a missing log names at most so many others.
+_NAMED_LOGS = 5
+
+
 def check_present(logs: Sequence[LogLocation]) -> None:
     """Check that the files of logs exist, before the imports of the pipeline, which take longer."""
     for log in logs:
         if isinstance(log, Path) and not log.exists():
             from ipsys_log.log.byte_source import open_for_reading
 
-            os.close(open_for_reading(log))
+            try:
+                os.close(open_for_reading(log))
+            except IpsysError as error:
+                if log.is_symlink():
+                    raise
+                beside = ", ".join(sorted(one.name for one in log.parent.glob("*.mcap"))[:_NAMED_LOGS])
+                raise IpsysError(f"{error}; the logs in this folder: {beside or 'none'}") from None
 
 
 def _named_as_log(path: Path | None) -> Path | None:

@@ -1,6 +1,7 @@
 """Tracking of the markers of one camera from frame to frame."""
 
 from collections.abc import Iterable, Sequence
+from math import inf
 
 import numpy as np
 
@@ -297,7 +298,8 @@ class MarkerTracker:
         """Return the fits and those of the candidates that are not among them.
 
         If two poses look alike, the function selects the upright pose. It selects the other pose if the
-        spread of its edges is less than ``better`` times that of the upright pose.
+        spread of its edges is less than ``better`` times that of the upright pose. A marker can have several
+        candidates: the best fits of its id count.
         """
         new_candidates = [
             candidate for candidate in candidates if not _among(candidate.id, candidate.corners_px, fits)
@@ -309,14 +311,18 @@ class MarkerTracker:
         new_fits = self._fit(grey, upright)
         # If the upright pose, usual for markers on robots, has a small spread, the other pose is not tried.
         unsure = [n for n, fit in enumerate(new_fits) if fit is None or fit.rms_px > _SURE_PX]
+        least_px: dict[int, float] = {}
+        for upright_fit in new_fits:
+            if upright_fit is not None:
+                marker_id = upright_fit.pose.id
+                least_px[marker_id] = min(upright_fit.rms_px, least_px.get(marker_id, inf))
         for n, fit in zip(unsure, self._fit(grey, [other[n] for n in unsure]), strict=True):
-            upright_fit = new_fits[n]
-            if fit is not None and (upright_fit is None or fit.rms_px < better * upright_fit.rms_px):
+            if fit is not None and fit.rms_px < better * least_px.get(fit.pose.id, inf):
                 new_fits[n] = fit
         new_fits = self._fit_disturbed(grey, list(zip(upright, other, strict=True)), new_fits)
         fits = list(fits)
-        for fit in new_fits:
-            if fit is not None and not _among(fit.pose.id, fit.corners_px, fits):
+        for fit in sorted((fit for fit in new_fits if fit is not None), key=lambda fit: fit.rms_px):
+            if not _among(fit.pose.id, fit.corners_px, fits):
                 fits.append(fit)
         return fits
 

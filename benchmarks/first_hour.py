@@ -22,6 +22,7 @@ import numpy as np
 from results import Report, command
 from rounds import Row
 
+from ipsys_log.engine.provenance import newest_run
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages.channels import TRACKS
 from ipsys_log.units import MM_PER_M
@@ -58,8 +59,8 @@ def _play(checkout: Path, folder: Path, name: str, report: Report) -> None:
             raise SystemExit(f"{' '.join(words)}: {done.stderr}")
     log = folder / "monday.mcap"
     with Session([log]) as session:
-        (topic,) = session.topics(TRACKS)
-    errors_mm = errors_m(log, topic.split("/")[2]) * MM_PER_M
+        run = newest_run(session, TRACKS)
+    errors_mm = errors_m(log, str(run)) * MM_PER_M
     report.rows += [
         Row(f"commands{name}", (float(len(commands)),), "count"),
         Row(f"waiting{name}", (sum(seconds) / 60,), "min"),

@@ -41,7 +41,7 @@ MISTAKES = {
     ),
     "board": Mistake("calibrate lab.mcap --board 5x", "--board 5x: is not a board", "as 6x4"),
     "point": Mistake("exclude lab.mcap p999", "has no calibration point 'p999'", "it has s000"),
-    "seconds": Mistake("record --rig lab.toml -o a.mcap --seconds 0", "'--seconds'", "greater than or equal to 0.1"),
+    "seconds": Mistake("record --rig lab.toml -o a.mcap --seconds 0", "'--seconds'", "equal to 0.1"),
     "label": Mistake("replay lab.mcap --train half", "has the label 'half'", "use --train"),
     "table": Mistake("export cal.mcap -o a.xyz", "a.xyz", ".csv"),
     "figure": Mistake("plan lab.mcap --plot floor.doc", "is not a figure file", "ends in .png, .pdf, .svg"),

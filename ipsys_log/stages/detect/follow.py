@@ -175,10 +175,8 @@ class MarkerTracker:
         fits = self._add(grey, fits, candidates, better)
         self.misprints = None
         if due or self._rejections:
-            known_px, is_odd = [fit.corners_px for fit in fits], bool(self._rejections)
-            self.misprints = self._inspect(
-                grey, self._dictionary, known_px, squares_px, has_rejections=is_odd
-            )
+            known_px, odd = [fit.corners_px for fit in fits], bool(self._rejections)
+            self.misprints = self._inspect(grey, self._dictionary, known_px, squares_px, has_rejections=odd)
         self._watch.forget([fit.corners_px for fit in fits])
         self._remember(list(seen), fits, time_ns)
         return sorted(fits, key=lambda fit: fit.pose.id), grey.shape[1], grey.shape[0]
@@ -301,9 +299,7 @@ class MarkerTracker:
         spread of its edges is less than ``better`` times that of the upright pose. A marker can have several
         candidates: the best fits of its id count.
         """
-        new_candidates = [
-            candidate for candidate in candidates if not _among(candidate.id, candidate.corners_px, fits)
-        ]
+        new_candidates = [one for one in candidates if not _among(one.id, one.corners_px, fits)]
         if not new_candidates:
             return fits
         self._candidates += new_candidates
@@ -311,19 +307,14 @@ class MarkerTracker:
         new_fits = self._fit(grey, upright)
         # If the upright pose, usual for markers on robots, has a small spread, the other pose is not tried.
         unsure = [n for n, fit in enumerate(new_fits) if fit is None or fit.rms_px > _SURE_PX]
-        least_px: dict[int, float] = {}
-        for upright_fit in new_fits:
-            if upright_fit is not None:
-                marker_id = upright_fit.pose.id
-                least_px[marker_id] = min(upright_fit.rms_px, least_px.get(marker_id, inf))
+        least_px = {fit.pose.id: fit.rms_px for fit in reversed(_best_first(new_fits))}
         for n, fit in zip(unsure, self._fit(grey, [other[n] for n in unsure]), strict=True):
             if fit is not None and fit.rms_px < better * least_px.get(fit.pose.id, inf):
                 new_fits[n] = fit
         new_fits = self._fit_disturbed(grey, list(zip(upright, other, strict=True)), new_fits)
-        fits = list(fits)
-        for fit in sorted((fit for fit in new_fits if fit is not None), key=lambda fit: fit.rms_px):
+        for fit in _best_first(new_fits):
             if not _among(fit.pose.id, fit.corners_px, fits):
-                fits.append(fit)
+                fits = [*fits, fit]
         return fits
 
     def _guess(self, candidates: Sequence[Candidate]) -> tuple[list[Guess], list[Guess]]:
@@ -370,6 +361,10 @@ class MarkerTracker:
             self._blurs_px.append(fits[0].blur_px)
         if fits:
             self._breadth_px = max(float(np.ptp(fit.corners_px, axis=0).min()) for fit in fits)
+
+
+def _best_first(fits: Iterable[MarkerFit | None]) -> list[MarkerFit]:
+    return sorted((fit for fit in fits if fit is not None), key=lambda fit: fit.rms_px)
 
 
 def _among(marker_id: int, corners_px: Array, fits: Iterable[MarkerFit]) -> bool:

@@ -26,8 +26,7 @@ from ipsys_log.stages.detect.misprints import find_misprints
 from ipsys_log.stages.detect.search import search_squares
 from ipsys_log.statistics.disagreement import Difference, OverlapStream
 from ipsys_log.units import CM_PER_M, MM_PER_M, NS_PER_S
-from ipsys_log.vision.decode import decode_grey
-from ipsys_log.vision.video import decode_keyframe, is_keyframe
+from ipsys_log.vision.video import decode_alone, is_keyframe
 
 # The state now is the median of the last sightings, at most so many and so old.
 _RECENT = 5
@@ -332,7 +331,7 @@ class CameraMonitor:
 
     def _check(self, camera: str, image: CompressedImage | CompressedVideo) -> FrameCheck:
         try:
-            grey = decode_grey(decode_keyframe(image) if isinstance(image, CompressedVideo) else image)
+            grey = decode_alone(image)
         except FrameError as error:
             return FrameCheck((), (), 0.0, 0.0, (f"a frame cannot be decoded: {error}",))
         dictionary = self._rig.dictionary

@@ -153,7 +153,7 @@ def check_start(
     for model in models:
         model_kind(model.name).step(model)  # loads its libraries: no frame must wait for them
     assert request.model_from is not None
-    return compare_labs(request.model_from, rig, lenses) + [
+    return compare_labs(request.model_from, models, rig, lenses) + [
         f"camera {name}: {request.model_from} has no model of this camera; it is recorded, but not used "
         "for tracking"
         for model in models

@@ -10,20 +10,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.engine.graph import Task
-from ipsys_log.engine.provenance import newest_run
+from ipsys_log.engine.provenance import complete_runs, newest_run, replaced_lenses
 from ipsys_log.engine.request import LEAST_OFFSET_PX, MIN_OFFSETS, Request, copied_run, fitted_in, has_corners
 from ipsys_log.engine.view import LogView
 from ipsys_log.errors import FitError, IpsysError
 from ipsys_log.log.contents import camera_of_topic
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.location import LogLocation
-from ipsys_log.messages import CameraCalibration, Event, Markers, Message, Positions, Rig, kind_of
+from ipsys_log.messages import CameraCalibration, Event, Markers, Message, Model, Positions, Rig, kind_of
 from ipsys_log.messages.channels import CAMERA_POINTS, EVALUATION, MARKERS, POSITIONS, RIG, Channel
 from ipsys_log.messages.events import CONTRADICTIONS
 from ipsys_log.models.table import needs_height
 from ipsys_log.plain_text import shell_words
 from ipsys_log.statistics.calibration_points import measured, split_ids, training_pairs
-from ipsys_log.statistics.model_kinds import can_evaluate, model_kind
+from ipsys_log.statistics.model_kinds import can_evaluate, joint_models, model_kind
 from ipsys_log.statistics.tape import RiggedMeasurement, world_point
 from ipsys_log.units import CM_PER_M, format_time
 
@@ -116,8 +116,8 @@ def check_models(
         run = newest_run(session, CAMERA_POINTS)
         cameras = {str(camera_of_topic(topic)) for topic in session.topics(CAMERA_POINTS, run)}
     with Session([request.model_from]) as other:
-        for name in models:
-            model, _ = fitted_in(other, name)
+        fitted_models = [fitted_in(other, name)[0] for name in models]
+        for model in fitted_models:
             if {EVALUATION, POSITIONS} & {*written}:
                 model_kind(model.name).restore(model)
             fitted = {camera.camera for camera in model.cameras}
@@ -129,7 +129,7 @@ def check_models(
                 )
     lenses = {name: session.payloads([topic])[-1] for name, topic in session.calibrations.items()}
     rig = request.rig or next(iter(session.payloads(session.topics(RIG))[-1:]), None)
-    return compare_labs(request.model_from, rig, {**lenses, **request.lenses})
+    return compare_labs(request.model_from, fitted_models, rig, {**lenses, **request.lenses})
 
 
 # Two cameras of one type differ by about 1 % in focal length; another lens or another crop by more.
@@ -139,13 +139,19 @@ _MOST_POINT_CHANGE_M, _MOST_SIDE_CHANGE = 0.02, 0.01
 
 
 def compare_labs(
-    model_from: LogLocation, rig: Rig | None, lenses: Mapping[str, CameraCalibration]
+    model_from: LogLocation,
+    models: Iterable[Model],
+    rig: Rig | None,
+    lenses: Mapping[str, CameraCalibration],
 ) -> list[str]:
-    """Compare a lab with that of a model; return one line for each difference of the rigs.
+    """Compare a lab with that of some models; return one line for each difference of the rigs.
+
+    A camera has the lens of a model if its focal length is that of the log, of intrinsics that replaced those
+    of the log in a run, or of the estimate of a joint model.
 
     Parameters
     ----------
-    model_from : the log with the model.
+    model_from, models : the log with the models, and those to apply.
     rig, lenses : those of the present lab; its intrinsics by camera.
 
     Raises
@@ -154,13 +160,19 @@ def compare_labs(
         A camera has another lens, or other images: the model gives wrong positions.
     """
     with Session([model_from]) as other:
-        fitted = {camera: other.payloads([topic])[-1] for camera, topic in other.calibrations.items()}
+        recorded = {camera: other.payloads([topic])[-1] for camera, topic in other.calibrations.items()}
+        replaced = [replaced_lenses(run) for run in complete_runs(other)]
         rigs = other.payloads(other.topics(RIG))[-1:]
-    for camera in sorted(fitted.keys() & lenses.keys()):
-        own, recorded = (float(lens.K[0, 0] / lens.width) for lens in (lenses[camera], fitted[camera]))
-        if abs(own / recorded - 1) > _MOST_FOCAL_CHANGE:
+    estimates = [joint_models(model) for model in models]
+    for camera in sorted(recorded.keys() & lenses.keys()):
+        width = recorded[camera].width
+        used = [recorded[camera], *(by_camera[camera] for by_camera in replaced if camera in by_camera)]
+        focals = [float(lens.K[0, 0] / lens.width) for lens in used]
+        focals += [float(joint[camera].lens[0] / width) for joint in estimates if camera in joint]
+        own = float(lenses[camera].K[0, 0] / lenses[camera].width)
+        if min(abs(own / focal - 1) for focal in focals) > _MOST_FOCAL_CHANGE:
             raise IpsysError(
-                f"camera {camera}: its focal length is {own:.3f} image widths, but {recorded:.3f} in "
+                f"camera {camera}: its focal length is {own:.3f} image widths, but {focals[-1]:.3f} in "
                 f"{model_from}: this is a model of other cameras; calibrate this lab, and give its log to "
                 "--model-from"
             )

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from ipsys_log.errors import FrameError
 from ipsys_log.extras import check_installed
-from ipsys_log.messages import CompressedVideo, RawImage
-from ipsys_log.vision.decode import MAX_PIXELS
+from ipsys_log.messages import CompressedImage, CompressedVideo, Grey, RawImage
+from ipsys_log.vision.decode import MAX_PIXELS, decode_grey
 
 if TYPE_CHECKING:
     from av.video.codeccontext import VideoCodecContext
@@ -234,6 +234,17 @@ def decode_keyframe(frame: CompressedVideo) -> RawImage:
     if image is None:
         raise FrameError(f"{len(frame.data)} bytes of {frame.format} that are no keyframe")
     return image
+
+
+def decode_alone(frame: CompressedImage | CompressedVideo | RawImage) -> Grey:
+    """Return the grey levels of an image or a keyframe, without other frames.
+
+    Raises
+    ------
+    FrameError
+        The frame is damaged, or it is of a video and no keyframe.
+    """
+    return decode_grey(decode_keyframe(frame) if isinstance(frame, CompressedVideo) else frame)
 
 
 def decode_last(backwards: Iterable[CompressedVideo]) -> RawImage | None:

@@ -15,6 +15,7 @@ from ipsys_log.api import python_api as api
 from ipsys_log.api.python_api import load_model
 from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.engine.graph import stages_until
+from ipsys_log.engine.model_checks import compare_labs
 from ipsys_log.engine.model_choice import choose_models, newest_model
 from ipsys_log.engine.output import write_log
 from ipsys_log.engine.request import Request
@@ -24,11 +25,21 @@ from ipsys_log.live_runs.survey.entry import TypedEntry, parse_entry
 from ipsys_log.live_runs.survey.from_log import open_finished_log
 from ipsys_log.live_runs.survey.scene import observe_marker
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import TRUTH_TOPIC, Markers, Measurement, Message, Model, Run, Tracks
-from ipsys_log.messages.channels import EVALUATION, MARKERS, MEASUREMENTS_TOPIC, POSITIONS, RIG
+from ipsys_log.messages import (
+    TRUTH_TOPIC,
+    CameraCalibration,
+    Markers,
+    Measurement,
+    Message,
+    Model,
+    Run,
+    Tracks,
+)
+from ipsys_log.messages.channels import EVALUATION, MARKERS, MEASUREMENTS_TOPIC, MODEL, POSITIONS, RIG
 from ipsys_log.models.locate_corners import FittedCornerModel
 from ipsys_log.models.table import MODELS
 from ipsys_log.statistics.joint_evaluation import JOINT_SUBSETS
+from tests.changed_logs import rewrite
 from tests.conftest import Ipsys
 from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab
 from tests.geometric.session import simulate_session
@@ -275,6 +286,26 @@ def test_models_are_the_best_that_a_log_allows(calibration: Path, tmp_path: Path
         choice = choose_models(Request(rig=given), [log], fuse)
         assert choice.models == (model,)
         assert reason in choice.reason
+
+
+def test_model_is_of_the_lenses_that_it_was_fitted_with(log: Path, fitted_log: Path) -> None:
+    """The log has other intrinsics than its model: they were replaced, or ``joint`` has estimated them."""
+
+    def widen(message: Message) -> Message:
+        if not isinstance(message.payload, CameraCalibration):
+            return message
+        wide = message.payload.K * np.array([[0.9, 1, 1], [1, 0.9, 1], [1, 1, 1]])
+        return replace(message, payload=replace(message.payload, K=wide))
+
+    with Session([fitted_log]) as session:
+        lenses = {camera: session.payloads([topic])[-1] for camera, topic in session.calibrations.items()}
+        (model,) = session.payloads(session.topics(MODEL, "joint"))
+    other = rewrite(log, widen, name="other.mcap")
+    with pytest.raises(IpsysError, match="this is a model of other cameras"):
+        compare_labs(other, [], None, lenses)
+    assert compare_labs(other, [model], None, lenses) == []
+    api.replay(other, model="rayplane", until="fit", calibrations=lenses)
+    assert compare_labs(other, [], None, lenses) == []
 
 
 def test_newest_run_of_the_user_is_continued(ipsys: Ipsys, fitted: Path) -> None:

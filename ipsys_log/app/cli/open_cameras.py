@@ -185,20 +185,21 @@ def _stop_after(
     """
     if on_signal:
         stop_on_signal(stop)
-    timers: list[Timer] = []
+    timer: Timer | None = None
 
     def begin(after_s: float = 0.0) -> None:
-        for timer in timers:
+        nonlocal timer
+        if timer is not None:
             timer.cancel()
-        timers.append(Timer(TIMEOUT_MAX if seconds is None else after_s + seconds, stop))
-        timers[-1].daemon = True
-        timers[-1].start()
+        timer = Timer(TIMEOUT_MAX if seconds is None else after_s + seconds, stop)
+        timer.daemon = True
+        timer.start()
 
     begin(_FIRST_FRAME_S)
     try:
         yield begin
     finally:
-        for timer in timers:
+        if timer is not None:
             timer.cancel()
 
 

@@ -18,8 +18,7 @@ from ipsys_log.calibration.lens_models import LENS_MODELS, find_lens_model
 from ipsys_log.errors import FrameError, IpsysError
 from ipsys_log.live_runs.survey.entry import Fault
 from ipsys_log.messages import CompressedImage, CompressedVideo, Grey
-from ipsys_log.vision.decode import decode_grey
-from ipsys_log.vision.video import decode_keyframe, is_keyframe
+from ipsys_log.vision.video import decode_alone, is_keyframe
 
 
 class BoardEntry(NamedTuple):
@@ -129,7 +128,7 @@ class BoardSearch:
         if isinstance(image, CompressedVideo) and not is_keyframe(image):
             return
         try:
-            grey = decode_grey(decode_keyframe(image) if isinstance(image, CompressedVideo) else image)
+            grey = decode_alone(image)
         except FrameError:
             return
         sighting = view_board(f"{self.count}", grey, self._board, thorough=False).sighting

@@ -14,8 +14,7 @@ from ipsys_log.errors import FrameError
 from ipsys_log.messages import CompressedImage, CompressedVideo, Grey, Message, Rig
 from ipsys_log.stages.detect.search import detect_markers
 from ipsys_log.units import NS_PER_S
-from ipsys_log.vision.decode import decode_grey
-from ipsys_log.vision.video import decode_keyframe, is_keyframe
+from ipsys_log.vision.video import decode_alone, is_keyframe
 
 # Cells of an image, along its height and width.
 _CELLS = 5, 8
@@ -54,8 +53,9 @@ class DriveCoverage:
         payload = message.payload
         self._begin_ns = self._begin_ns or message.log_time_ns
         self.seconds = (message.log_time_ns - self._begin_ns) / NS_PER_S
-        is_image = isinstance(payload, CompressedImage)
-        if message.camera not in self._cells or not (is_image or _is_key(payload)):
+        if message.camera not in self._cells or not isinstance(payload, CompressedImage | CompressedVideo):
+            return
+        if isinstance(payload, CompressedVideo) and not is_keyframe(payload):
             return
         with self._lock:
             self._waiting[message.camera] = payload
@@ -93,7 +93,7 @@ class DriveCoverage:
             waiting, self._waiting = self._waiting, {}
         for camera, image in waiting.items():
             try:
-                grey = decode_grey(decode_keyframe(image) if isinstance(image, CompressedVideo) else image)
+                grey = decode_alone(image)
             except FrameError:
                 continue
             self._note(camera, image.timestamp, grey)
@@ -117,7 +117,3 @@ class DriveCoverage:
                     x, y = marker.corners_px.mean(axis=0) / [width, height]
                     row, column = int(y * _CELLS[0]), int(x * _CELLS[1])
                     self._cells[camera][min(row, _CELLS[0] - 1), min(column, _CELLS[1] - 1)] = True
-
-
-def _is_key(payload: object) -> bool:
-    return isinstance(payload, CompressedVideo) and is_keyframe(payload)

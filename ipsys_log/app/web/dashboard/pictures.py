@@ -13,8 +13,8 @@ import simplejpeg
 from ipsys_log.errors import FrameError
 from ipsys_log.messages import CompressedImage, CompressedVideo, Markers, Message, RawImage
 from ipsys_log.units import NS_PER_S
-from ipsys_log.vision.decode import check_encoded, decode_grey
-from ipsys_log.vision.video import decode_keyframe, is_keyframe
+from ipsys_log.vision.decode import check_encoded
+from ipsys_log.vision.video import decode_alone, is_keyframe
 
 # At most five pictures of a camera per second.
 EVERY_NS = NS_PER_S // 5
@@ -41,7 +41,7 @@ def shrink(frame: CompressedImage | CompressedVideo | RawImage) -> bytes:
         except ValueError as error:
             raise FrameError(str(error)) from error
         return bytes(simplejpeg.encode_jpeg(image, quality=_QUALITY, colorspace="RGB", fastdct=True))
-    grey = decode_grey(decode_keyframe(frame) if isinstance(frame, CompressedVideo) else frame)
+    grey = decode_alone(frame)
     height, width = grey.shape
     if width > _WIDTH_PX:
         size = _WIDTH_PX, max(round(height * _WIDTH_PX / width), 1)

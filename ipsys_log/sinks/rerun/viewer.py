@@ -178,13 +178,12 @@ class ViewerPage:
         self._complaints.close()
 
     def _wait(self) -> None:
-        """Wait until the viewer takes data."""
+        """Wait until the viewer takes data and serves its page; it opens the page after the data."""
         for _ in range(_TURNS):
             if self._process.poll() is not None:
                 raise IpsysError(f"--rerun: the viewer cannot be served ({last_line(self._complaints)})")
-            with socket.socket() as probe:
-                if probe.connect_ex((_LOOPBACK, self._data_port)) == 0:
-                    return
+            if _is_open(self._data_port) and _is_open(self._page_port):
+                return
             threading.Event().wait(_TURN_S)
         raise IpsysError("--rerun: the viewer does not start; try again when the machine is less busy")
 
@@ -196,6 +195,11 @@ def _header() -> bytes:
         return rr.binary_stream(recording).read() or b""
     finally:
         recording.disconnect()
+
+
+def _is_open(port: int) -> bool:
+    with socket.socket() as probe:
+        return probe.connect_ex((_LOOPBACK, port)) == 0
 
 
 def _free_ports() -> tuple[int, int]:

@@ -28,6 +28,7 @@ LIBRARIES = {
     "zenoh": Library("Zenoh", ("nodes", "ros2")),
     "rosbags": Library("rosbags", ("ros2",)),
     "xxhash": Library("xxhash", ("ros2",)),
+    "c3d": Library("c3d", ("mocap",)),
     "websockets": Library("websockets", ("foxglove",)),
     "fsspec": Library("fsspec", ("remote",)),
     "dask": Library("Dask", ("batch",)),

@@ -26,10 +26,12 @@ from ipsys_log.models.table import model_run
 from ipsys_log.plain_text import join_names, shell_words
 from ipsys_log.statistics.accuracy import root_mean_square_m
 from ipsys_log.statistics.ground_truth import gather_paths, trajectory_errors
+from ipsys_log.units import NS_PER_S
 
 if TYPE_CHECKING:
     import pandas as pd
 
+    from ipsys_log.api.compared_estimates import ComparedEstimates
     from ipsys_log.tools.soundness.finding import LogCheck
 
 _STATISTICS = ("count", "rmse_m", "mean_m", "median_m", "std_m", "max_m", "p95_m")
@@ -252,6 +254,40 @@ class Log:
             ]
         table: pd.DataFrame = pandas.DataFrame(rows, columns=[*_TRAJECTORY])
         return table
+
+    def compare(
+        self,
+        *estimates: StrPath,
+        robot: str | Sequence[str] = (),
+        run: str | None = None,
+        topic: str | None = None,
+        align: str = "2d",
+        time_offset_s: float | None = None,
+        pivot_m: tuple[float, float, float] | None = None,
+        scale: bool = False,
+    ) -> ComparedEstimates:
+        """Score estimates of robots against their tracks; without estimates, those that the log stores.
+
+        The options are those of ``ipsys compare``, which also appends the estimates to the log.
+
+        Returns
+        -------
+        ComparedEstimates : two pandas tables: ``errors`` (ATE and RPE) and ``estimates``.
+
+        Raises
+        ------
+        IpsysError
+            An estimate cannot be read or does not fit the tracks, or pandas is not installed.
+        """
+        from ipsys_log.api.compared_estimates import compare_estimates
+        from ipsys_log.statistics.trajectories import KnownParts
+        from ipsys_log.tools.estimates import CompareOptions
+
+        offset_ns = None if time_offset_s is None else round(time_offset_s * NS_PER_S)
+        known = KnownParts(offset_ns, align, pivot_m, scale)
+        names = (robot,) if isinstance(robot, str) else tuple(robot)
+        options = CompareOptions(names, run and model_run(run), known, topic)
+        return compare_estimates(self._session, [Path(path) for path in estimates], options)
 
     def export(
         self,

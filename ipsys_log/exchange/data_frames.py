@@ -30,6 +30,7 @@ from ipsys_log.messages import (
 from ipsys_log.messages.channels import (
     CAMERA_POINTS,
     COMMANDS,
+    ESTIMATE,
     EVENTS,
     LATENCY,
     MARKERS,
@@ -83,6 +84,7 @@ _ITEMS = {
     "tracks": _Table(TRACKS, Tracks, _TRACK),
     "smoothed_tracks": _Table(SMOOTHED_TRACKS, Tracks, _TRACK),
     "truth": _Table(TRUTH, Tracks, ("robot", *_POINT)),
+    "estimate": _Table(ESTIMATE, Tracks, ("robot", *_POINT, "heading_sigma_rad")),
 }
 TABLES = (*_ITEMS, "measurements", "events", "latency", "commands", "pairs")
 

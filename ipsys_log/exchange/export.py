@@ -26,7 +26,7 @@ FORMATS = {".csv": "csv", ".parquet": "parquet"}
 # Formats of trajectories, by the suffix of the file.
 TRAJECTORIES = {".tum": "tum", ".kitti": "kitti"}
 # Tables with robots.
-_WITH_ROBOTS = ("tracks", "truth")
+_WITH_ROBOTS = ("tracks", "truth", "estimate")
 # Columns with several texts in a row.
 _LISTS = ("cameras", "splits")
 

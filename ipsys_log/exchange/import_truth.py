@@ -1,7 +1,8 @@
 """Import of ground truth from another system: its clock and coordinates become those of the lab."""
 
+import re
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,32 +11,31 @@ import numpy as np
 
 from ipsys_log.engine.output import append_run, open_target
 from ipsys_log.engine.provenance import fingerprint, free_name, newest_run, read_channels
+from ipsys_log.engine.request import Progress
 from ipsys_log.errors import IpsysError
-from ipsys_log.exchange.ground_truth_files import (
-    LENGTH_UNITS,
-    TIME_UNITS,
-    TruthPath,
-    TruthUnits,
-    read_truth_files,
-)
-from ipsys_log.exchange.truth_alignment import (
-    ALIGNMENTS,
-    Residuals,
-    RigidMotion,
-    TruthAlignment,
-    align_truth,
-    residuals_of,
-)
+from ipsys_log.exchange.trajectory_columns import GivenUnits
+from ipsys_log.exchange.trajectory_files import Wanted, assign_robots, read_trajectories, selected_bodies
+from ipsys_log.exchange.trajectory_tables import LENGTH_UNITS, TIME_UNITS
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import IMPORTED, RIG_TOPIC, TRUTH_TOPIC, Message, Rig, Run, Track, Tracks
 from ipsys_log.messages.channels import RIG, TRACKS, TRUTH
 from ipsys_log.messages.rig_file import check_robots
-from ipsys_log.statistics.calibration_points import TimedPoints
-from ipsys_log.statistics.ground_truth import gather_tracks
-from ipsys_log.statistics.path_pairs import PathPair
+from ipsys_log.statistics.ground_truth import LONGEST_GAP_NS, TrackedPath, gather_paths, last_poses
+from ipsys_log.statistics.path_alignment import (
+    PathAlignment,
+    Residuals,
+    align_trajectories,
+)
+from ipsys_log.statistics.path_cleaning import select_rows
+from ipsys_log.statistics.path_pairs import PathPair, common_instants
+from ipsys_log.statistics.path_problem import ALIGNMENTS
+from ipsys_log.statistics.trajectories import KnownParts, Trajectory, TrajectoryPair
 from ipsys_log.units import NS_PER_S, format_time
+from ipsys_log.vision.time_brackets import bracket_times
 
 _RUN = "truth"
+# Parameters of the record that are no numbers.
+TEXTS = ("format", "files", "align", "axes", "remarks")
 _MARKER_PREFIX = "marker_"
 
 
@@ -45,17 +45,19 @@ class TruthOptions:
 
     Attributes
     ----------
-    robots : the robot of each file that names none.
+    robots : the robot of each file that names none, or ``NAME=BODY`` for a body of a file.
     align : ``2d``, ``3d`` or ``none``.
     time_offset_ns : to add to the times of the files; None to estimate it.
+    pivot_m : from the marker to the origin of the other body, in the axes of the marker; None to estimate it.
     run : the run whose tracks are compared; None: the newest complete one.
     rig : replaces the rig of the log.
     """
 
     robots: tuple[str, ...] = ()
-    units: TruthUnits | None = None
+    units: GivenUnits | None = None
     align: str = "2d"
     time_offset_ns: int | None = None
+    pivot_m: tuple[float, float, float] | None = None
     run: str | None = None
     rig: Rig | None = None
 
@@ -78,12 +80,17 @@ class ImportedTruth:
     tracks_run: str | None
     poses: dict[str, int]
     time_offset_ns: int
-    alignment: TruthAlignment | None
+    alignment: PathAlignment | None
     residuals: Residuals | None
 
 
 def import_truth(
-    files: Sequence[Path], into: Path | None, output: Path | None, options: TruthOptions
+    files: Sequence[Path],
+    into: Path | None,
+    output: Path | None,
+    options: TruthOptions,
+    say: Callable[[str], None] = lambda line: None,
+    progress: Progress = lambda step, done, total: None,
 ) -> ImportedTruth:
     """Write the ground truth of files on the channel ``/truth/tracks``, in the lab's clock and coordinates.
 
@@ -91,6 +98,7 @@ def import_truth(
     ----------
     into : the log of the same drive, which gets the truth unless there is an ``output``.
     output : a new log for the truth.
+    say : called with what was understood of each file, before anything is written.
 
     Raises
     ------
@@ -99,18 +107,24 @@ def import_truth(
         log has ground truth already. Nothing is written then.
     """
     _check_options(into, output, options)
-    paths = read_truth_files(files, options.robots, options.units)
+    wanted = Wanted(selected_bodies(options.robots), options.units)
+    read = [read_trajectories(path, wanted, progress) for path in files]
+    for line in (line for one in read for line in (*one.understood, *one.remarks)):
+        say(line)
     where = ", ".join(map(str, files))
     with ExitStack() as stack:
         session = stack.enter_context(Session([into])) if into is not None else None
-        ids = _marker_ids(_rig(session, options.rig), paths, where)
+        rig = _rig(session, options.rig)
+        known = {rig.robot_of(marker.id) for marker in rig.markers}
+        paths = assign_robots(read, options.robots, known)
+        ids = _marker_ids(rig, paths, where)
         if session is not None and session.topics(TRUTH):
             raise IpsysError(f"{session}: has ground truth already; import into a log without it")
         run = _tracks_run(session, options.run)
         tracks = _tracks(session, run, ids)
         fitted = _fit(paths, tracks, options, session, run, where)
         record = _record(files, options, fitted, session, run if tracks else None)
-        messages = list(_messages(paths, ids, fitted, where))
+        messages = list(_messages(fitted, ids, where))
         last_ns = messages[-1].log_time_ns
         record = replace(record, timestamp=last_ns)
         if session is None:  # a new log: its rig comes first
@@ -121,7 +135,7 @@ def import_truth(
         output or target,
         record,
         run if tracks else None,
-        {path.robot: len(path.times_ns) for path in paths},
+        {path.name: len(path.times_ns) for path in fitted.poses},
         fitted.time_offset_ns,
         fitted.alignment,
         fitted.residuals,
@@ -131,9 +145,13 @@ def import_truth(
 def _check_options(into: Path | None, output: Path | None, options: TruthOptions) -> None:
     if into is None and output is None:
         raise IpsysError("no log is named; give --into LOG, or -o LOG for a new one")
-    units = options.units or TruthUnits()
+    check_choices(options.align, options.units or GivenUnits())
+
+
+def check_choices(align: str, units: GivenUnits) -> None:
+    """Check the values of ``--align``, ``--time-unit`` and ``--length-unit``."""
     for option, value, known in (
-        ("--align", options.align, [*ALIGNMENTS]),
+        ("--align", align, [*ALIGNMENTS]),
         ("--time-unit", units.time, [None, *TIME_UNITS]),
         ("--length-unit", units.length, [None, *LENGTH_UNITS]),
     ):
@@ -144,9 +162,11 @@ def _check_options(into: Path | None, output: Path | None, options: TruthOptions
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Fitted:
+    """The poses of the markers in the lab, and how they came there."""
+
+    poses: Sequence[Trajectory]
     time_offset_ns: int
-    motion: RigidMotion | None
-    alignment: TruthAlignment | None = None
+    alignment: PathAlignment | None = None
     residuals: Residuals | None = None
 
 
@@ -161,20 +181,20 @@ def _rig(session: Session | None, given: Rig | None) -> Rig:
     return rigs[-1]
 
 
-def _marker_ids(rig: Rig, paths: Sequence[TruthPath], where: str) -> dict[str, int]:
+def _marker_ids(rig: Rig, paths: Sequence[Trajectory], where: str) -> dict[str, int]:
     """Return the id of the marker of each robot; a rig without markers has robots ``marker_<id>``."""
-    check_robots(rig, [path.robot for path in paths], where)
+    check_robots(rig, [path.name for path in paths], where)
     ids = {rig.robot_of(marker.id): marker.id for marker in rig.markers}
     return {
-        path.robot: ids[path.robot] if ids else int(path.robot.removeprefix(_MARKER_PREFIX)) for path in paths
+        path.name: ids[path.name] if ids else int(path.name.removeprefix(_MARKER_PREFIX)) for path in paths
     }
 
 
-def _tracks(session: Session | None, run: str | None, ids: dict[str, int]) -> dict[str, TimedPoints]:
+def _tracks(session: Session | None, run: str | None, ids: dict[str, int]) -> dict[str, TrackedPath]:
     """Return the tracks of a run by robot, for the robots with a track."""
     if session is None or run is None:
         return {}
-    tracks = gather_tracks(session.messages(session.topics(TRACKS, run)))
+    tracks = gather_paths(session.messages(session.topics(TRACKS, run)))
     return {robot: tracks[marker_id] for robot, marker_id in ids.items() if marker_id in tracks}
 
 
@@ -190,8 +210,8 @@ def _tracks_run(session: Session | None, run: str | None) -> str | None:
 
 
 def _fit(
-    paths: Sequence[TruthPath],
-    tracks: dict[str, TimedPoints],
+    paths: Sequence[Trajectory],
+    tracks: dict[str, TrackedPath],
     options: TruthOptions,
     session: Session | None,
     run: str | None,
@@ -202,27 +222,63 @@ def _fit(
     if given_ns is not None and session is not None:
         _check_overlap(paths, given_ns, tracks, session, where)
     if options.align == "none" and given_ns is not None:
-        return _Fitted(given_ns, None, residuals=_given_residuals(paths, tracks, given_ns))
+        poses = [replace(path, times_ns=path.times_ns + given_ns) for path in paths]
+        return _Fitted(poses, given_ns, residuals=_given_residuals(poses, tracks))
     if not tracks:
         raise IpsysError(_no_tracks(paths, session, run))
-    pairs, zero_ns = _pairs(paths, tracks)
-    offset_s = None if given_ns is None else (given_ns - zero_ns) / NS_PER_S
-    found = align_truth(pairs, options.align, where, offset_s)
-    offset_ns = zero_ns + round(found.offset_s * NS_PER_S) if given_ns is None else given_ns
-    return _Fitted(offset_ns, None if options.align == "none" else found.motion, found, found.residuals)
+    pairs = [TrajectoryPair(path, tracks[path.name]) for path in paths if path.name in tracks]
+    found = align_trajectories(pairs, KnownParts(given_ns, options.align, options.pivot_m), where)
+    numbers = {pair.other.name: number for number, pair in enumerate(pairs)}
+    poses = [
+        _marker_poses(found, numbers[path.name], tracks[path.name])
+        if path.name in numbers
+        else found.lab_poses(path)
+        for path in paths
+    ]
+    return _Fitted(poses, found.offset_ns, found, found.residuals)
 
 
-def _given_residuals(
-    paths: Sequence[TruthPath], tracks: dict[str, TimedPoints], offset_ns: int
-) -> Residuals | None:
-    if not tracks:
+def _given_residuals(poses: Sequence[Trajectory], tracks: dict[str, TrackedPath]) -> Residuals | None:
+    """Return the residuals of poses that are in the lab already; None without common instants."""
+    pairs = []
+    for path in (path for path in poses if path.name in tracks):
+        track = tracks[path.name].positions
+        rows, zero_ns = last_poses(track), min(int(path.times_ns[0]), int(track.times_ns[0]))
+        true_s, track_s = (
+            (times_ns - zero_ns) / NS_PER_S for times_ns in (path.times_ns, track.times_ns[rows])
+        )
+        pairs.append(PathPair(true_s, path.points_m, track_s, track.points_m[rows]))
+    common = common_instants(pairs, 0.0) if pairs else None
+    if common is None or not len(common.track_m):
         return None
-    pairs, zero_ns = _pairs(paths, tracks)
-    return residuals_of(pairs, (offset_ns - zero_ns) / NS_PER_S, RigidMotion(np.eye(3), np.zeros(3)))
+    return Residuals.of((common.track_m - common.true_m) ** 2)
 
 
-def _no_tracks(paths: Sequence[TruthPath], session: Session | None, run: str | None) -> str:
-    names = ", ".join(path.robot for path in paths)
+def _marker_poses(alignment: PathAlignment, number: int, track: TrackedPath) -> Trajectory:
+    """Return the poses of the marker of a robot, from those of the body of the other system.
+
+    A body without rotations has the headings of the track.
+    """
+    from scipy.spatial.transform import Rotation
+
+    poses, body = alignment.poses[number], alignment.bodies[number]
+    is_turned = np.asarray(np.isfinite(poses.quaternions).all(axis=1))
+    quaternions, axes = np.full((len(is_turned), 4), np.nan), np.full((len(is_turned), 3, 3), np.nan)
+    if is_turned.any():
+        marker = Rotation.from_quat(poses.quaternions[is_turned]) * Rotation.from_euler("z", -body.turn_rad)
+        quaternions[is_turned], axes[is_turned] = marker.as_quat(), marker.as_matrix()
+    brackets = bracket_times(track.positions.times_ns, poses.times_ns, LONGEST_GAP_NS)
+    by_track = np.asarray(np.unwrap(np.nan_to_num(track.headings_rad)))
+    rest = ~is_turned & brackets.is_known
+    if rest.any():
+        axes[rest] = Rotation.from_euler("z", brackets.mix(by_track)[rest, None]).as_matrix()
+    points_m = poses.points_m - (axes @ body.pivot_m if body.pivot_m.any() else 0.0)
+    known = np.asarray(np.isfinite(points_m).all(axis=1))
+    return select_rows(replace(poses, points_m=points_m, quaternions=quaternions), known)
+
+
+def _no_tracks(paths: Sequence[Trajectory], session: Session | None, run: str | None) -> str:
+    names = ", ".join(path.name for path in paths)
     lacks = "a log without tracks" if session is None else f"{session}: has no tracks"
     if run is not None:
         lacks = f"{session}: run {run} has no track of {names}"
@@ -233,11 +289,11 @@ def _no_tracks(paths: Sequence[TruthPath], session: Session | None, run: str | N
 
 
 def _check_overlap(
-    paths: Sequence[TruthPath], offset_ns: int, tracks: dict[str, TimedPoints], session: Session, where: str
+    paths: Sequence[Trajectory], offset_ns: int, tracks: dict[str, TrackedPath], session: Session, where: str
 ) -> None:
     start_ns = min(int(path.times_ns[0]) for path in paths) + offset_ns
     end_ns = max(int(path.times_ns[-1]) for path in paths) + offset_ns
-    ends_ns = [int(track.times_ns[place]) for track in tracks.values() for place in (0, -1)]
+    ends_ns = [int(track.positions.times_ns[place]) for track in tracks.values() for place in (0, -1)]
     first_ns, last_ns = min(ends_ns, default=session.start_ns), max(ends_ns, default=session.end_ns)
     if end_ns < first_ns or start_ns > last_ns:
         raise IpsysError(
@@ -252,35 +308,17 @@ def _time(time_ns: int) -> str:
     return format_time(time_ns) if 0 <= time_ns < 1 << 63 else f"{time_ns / NS_PER_S:.3f} s"
 
 
-def _pairs(paths: Sequence[TruthPath], tracks: dict[str, TimedPoints]) -> tuple[list[PathPair], int]:
-    """Return the paths of both systems, each in s since its start, and the difference of the starts in ns."""
-    true_ns = min(int(path.times_ns[0]) for path in paths)
-    track_ns = min(int(track.times_ns[0]) for track in tracks.values())
-    pairs = []
-    for path in paths:
-        if path.robot in tracks:
-            track = tracks[path.robot]
-            # Tracks of earlier versions have several poses at an instant; the last one uses all cameras.
-            times_ns, last = np.unique(track.times_ns[::-1], return_index=True)
-            true_s, track_s = (path.times_ns - true_ns) / NS_PER_S, (times_ns - track_ns) / NS_PER_S
-            pairs.append(PathPair(true_s, path.points_m, track_s, track.points_m[::-1][last]))
-    return pairs, track_ns - true_ns
-
-
-def _messages(
-    paths: Sequence[TruthPath], ids: dict[str, int], fitted: _Fitted, where: str
-) -> Iterator[Message]:
+def _messages(fitted: _Fitted, ids: dict[str, int], where: str) -> Iterator[Message]:
     """Yield the poses of all robots by instant."""
     by_time: dict[int, list[Track]] = defaultdict(list)
-    for path in paths:
-        points_m, forward = path.points_m, path.forward
-        if fitted.motion is not None:
-            points_m, forward = fitted.motion.apply(points_m), forward @ fitted.motion.rotation.T
-        rows = zip(path.times_ns.tolist(), points_m.tolist(), forward.tolist(), strict=True)
-        for time_ns, (x_m, y_m, z_m), (ahead, left, _) in rows:
-            heading_rad = float(np.arctan2(left, ahead)) if np.isfinite(ahead) else None
-            track = Track(path.robot, ids[path.robot], x_m, y_m, z_m, heading_rad)
-            by_time[time_ns + fitted.time_offset_ns].append(track)
+    for path in fitted.poses:
+        x, y, z, w = path.quaternions.T
+        # The heading is that of the x axis.
+        headings_rad = np.arctan2(2 * (x * y + z * w), 1 - 2 * (y * y + z * z)).tolist()
+        rows = zip(path.times_ns.tolist(), path.points_m.tolist(), headings_rad, strict=True)
+        for time_ns, (x_m, y_m, z_m), heading_rad in rows:
+            known = heading_rad if np.isfinite(heading_rad) else None
+            by_time[time_ns].append(Track(path.name, ids[path.name], x_m, y_m, z_m, known))
     if min(by_time) < 0 or max(by_time) >= 1 << 62:
         raise IpsysError(
             f"{where}: the times in the clock of the lab are before 1970 or after 2116; check --time-offset"
@@ -301,6 +339,9 @@ def _record(
         "time_offset_s": _seconds(fitted.time_offset_ns),
         **_numbers(fitted),
     }
+    if fitted.alignment is not None:
+        texts = {"axes": fitted.alignment.axes, "remarks": "\n".join(fitted.alignment.remarks)}
+        parameters |= {name: text for name, text in texts.items() if text}
     record = Run(0, _RUN, IMPORTED, parameters, fingerprint(), number=1)
     if session is None:
         return record
@@ -317,23 +358,40 @@ def _numbers(fitted: _Fitted) -> dict[str, str]:
     """Return the estimates with all digits, and standard deviations and residuals with a few, as texts."""
     estimates: dict[str, float] = {}
     errors: dict[str, float] = {}
-    found, motion = fitted.alignment, fitted.motion
-    if found is not None and found.offset_sigma_s is not None:
-        errors["time_offset_sigma_s"] = found.offset_sigma_s
-    if found is not None and motion is not None:
+    if (found := fitted.alignment) is not None:
+        values = {
+            "time_offset_s": (None, found.offset_sigma_s),
+            "clock_drift": (found.drift, found.drift_sigma),
+        }
         for axis, name in enumerate("xyz"):
-            if np.isfinite(found.turn_sigmas_rad[axis]):
-                estimates[f"rotation_{name}_rad"] = float(found.turn_rad[axis])
-                errors[f"rotation_{name}_sigma_rad"] = float(found.turn_sigmas_rad[axis])
-            if np.isfinite(found.shift_sigmas_m[axis]):
-                estimates[f"translation_{name}_m"] = float(motion.shift_m[axis])
-                errors[f"translation_{name}_sigma_m"] = float(found.shift_sigmas_m[axis])
+            turn, shift = found.turn_rad[axis], found.motion.shift_m[axis]
+            values[f"rotation_{name}_rad"] = turn, found.turn_sigmas_rad[axis]
+            values[f"translation_{name}_m"] = shift, found.shift_sigmas_m[axis]
+        for robot, body in zip(found.names, found.bodies, strict=True):
+            for axis, name in enumerate("xyz"):
+                values[f"{robot}_pivot_{name}_m"] = body.pivot_m[axis], body.pivot_sigmas_m[axis]
+            values[f"{robot}_body_turn_rad"] = body.turn_rad, body.turn_sigma_rad
+        for name, (value, sigma) in values.items():
+            if np.isfinite(sigma):
+                estimates |= {} if value is None else {name: float(value)}
+                errors[sigma_name(name)] = float(sigma)
     if (residuals := fitted.residuals) is not None:
         errors |= {"rmse_2d_m": residuals.rmse_2d_m, "rmse_3d_m": residuals.rmse_3d_m}
         estimates |= {"instants": residuals.instants, "outliers": residuals.outliers}
     return {name: repr(value) for name, value in estimates.items()} | {
         name: f"{value:.4g}" for name, value in errors.items()
     }
+
+
+def sigma_name(name: str) -> str:
+    """Return the parameter of a record with the standard deviation of another one.
+
+    Examples
+    --------
+    >>> sigma_name("pivot_x_m"), sigma_name("scale")
+    ('pivot_x_sigma_m', 'scale_sigma')
+    """
+    return re.sub(r"(_(?:m|rad|s))?$", r"_sigma\1", name, count=1)
 
 
 def _seconds(time_ns: int) -> str:

@@ -4,7 +4,7 @@ The library decompresses whole chunks, files and messages, without a limit. The 
 """
 
 import bz2
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache, partial
@@ -17,7 +17,7 @@ import zstandard
 from rosbags.interfaces import Connection, MessageDefinitionFormat
 from rosbags.rosbag1 import Reader as Reader1
 from rosbags.rosbag2 import Reader as Reader2
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from ipsys_log.engine.request import Progress
@@ -43,7 +43,7 @@ from ipsys_log.vision.decode import RAW_ENCODINGS
 from ipsys_log.vision.lenses import check_calibration, same_intrinsics
 
 _STEP = "bag"
-_Reader = Reader1 | Reader2
+BagReader = Reader1 | Reader2
 _IMAGES = (CompressedImage, RawImage)
 # These topics hold depths in a format of their own, though their type is that of images.
 _DEPTHS = "/compressedDepth"
@@ -70,8 +70,8 @@ def find_bag_cameras(path: Path, named: Mapping[str, str]) -> BagCameras:
     IpsysError
         The file is not a bag or has no images; a topic does not exist; two cameras have one name.
     """
-    with _open_bag(path) as reader:
-        types = {connection.topic: _payload(connection) for connection in reader.connections}
+    with open_bag(path) as reader:
+        types = {one.topic: ROS2_PAYLOADS.get(one.msgtype) for one in reader.connections}
     images = [topic for topic, kind in types.items() if kind in _IMAGES and not topic.endswith(_DEPTHS)]
     for camera, topic in named.items():
         if topic not in images:
@@ -126,7 +126,7 @@ def read_bag(
     given = dict(lenses or {})
     camera_of = {topic: camera for camera, topic in cameras.images.items()}
     camera_of |= {topic: camera for camera, topic in cameras.lenses.items() if camera not in given}
-    with _open_bag(path) as reader:
+    with open_bag(path) as reader:
         connections = [connection for connection in reader.connections if connection.topic in camera_of]
         total = sum(connection.msgcount for connection in connections)
         log_ns = max(int(reader.start_time) - len(given) - 2, 0)  # a simulated clock starts at 0
@@ -151,25 +151,33 @@ def read_bag(
 
 
 def _rows(
-    path: Path, reader: _Reader, connections: list[Connection]
+    path: Path, reader: BagReader, connections: list[Connection]
 ) -> Iterator[tuple[str, int, CompressedImage | RawImage | CameraCalibration]]:
     """Yield topic, time and payload of the messages of some connections."""
-    is_packed = bound_reader(path, reader)
     decode = {connection.id: _decoder(path, reader, connection) for connection in connections}
-    messages = reader.messages(connections) if connections else iter(())
-    while True:
-        with _faults(path):
-            row = next(messages, None)
-            if row is None:
-                return
-            connection, time_ns, data = row
-            data = unpack_message(path, data) if is_packed else bytes(data)
+    for connection, time_ns, data in raw_messages(path, reader, connections):
         try:
             payload = decode[connection.id](data)
         except LogError as error:
             raise IpsysError(f"{path}: {connection.topic} at {time_ns} ns: {error}") from error
         _check_image(payload, f"{path}: {connection.topic}")
         yield connection.topic, time_ns, payload
+
+
+def raw_messages(
+    path: Path, reader: BagReader, connections: Sequence[Connection]
+) -> Iterator[tuple[Connection, int, bytes]]:
+    """Yield connection, time of the bag and bytes of the messages of some connections."""
+    is_packed = bound_reader(path, reader)
+    messages = reader.messages(connections) if connections else iter(())
+    while True:
+        with faults(path):
+            row = next(messages, None)
+            if row is None:
+                return
+            connection, time_ns, data = row
+            data = unpack_message(path, data) if is_packed else bytes(data)
+        yield connection, time_ns, data
 
 
 def _is_new(lens: CameraCalibration, known: CameraCalibration | None) -> bool:
@@ -197,34 +205,28 @@ def _check_image(payload: object, where: str) -> None:
         )
 
 
-def _payload(connection: Connection) -> type | None:
-    return ROS2_PAYLOADS.get(connection.msgtype)
-
-
 @contextmanager
-def _open_bag(path: Path) -> Iterator[_Reader]:
-    """Open a bag."""
+def open_bag(path: Path) -> Iterator[BagReader]:
     if not path.exists():
         raise IpsysError(f"{path}: does not exist; give a bag of ROS 1 (.bag), or a folder of ROS 2")
     if path.is_dir() and not (path / "metadata.yaml").is_file():
         raise IpsysError(
             f"{path}: is not a bag of ROS 2: it has no metadata.yaml; run: ros2 bag reindex {path}"
         )
-    is_ros1 = path.suffix == ".bag"
-    with _faults(path):
-        if not is_ros1:
+    with faults(path):
+        if is_ros2 := path.suffix != ".bag":
             check_files(path)
-        reader = Reader1(path) if is_ros1 else Reader2(path)
+        reader = Reader2(path) if is_ros2 else Reader1(path)
         reader.open()
     try:
         yield reader
     finally:
-        with _faults(path):
+        with faults(path):
             reader.close()
 
 
 @contextmanager
-def _faults(path: Path) -> Iterator[None]:
+def faults(path: Path) -> Iterator[None]:
     """Give the errors of the readers of rosbags one line. The block has only calls of these."""
     try:
         yield
@@ -240,29 +242,39 @@ def _faults(path: Path) -> Iterator[None]:
         ) from error
 
 
-def _decoder(path: Path, reader: _Reader, connection: Connection) -> Callable[[bytes], Any]:
+def _decoder(path: Path, reader: BagReader, connection: Connection) -> Callable[[bytes], Any]:
     """Return the function that decodes the messages of a connection, by the definitions of ROS itself."""
     name = connection.msgtype
     if isinstance(reader, Reader1):
-        store = _store(Stores.ROS1_NOETIC)
-        if connection.digest != store.generate_msgdef(name)[1]:
-            raise IpsysError(f"{path}: {connection.topic}: its type {name} is not the one of ROS 1")
+        store = ros1_types(path, connection)
         return lambda data: convert_ros(name, _read_ros1(path, store, name, data))
     # Old bags have no definitions; those of their time are the same.
-    text = _store(Stores.ROS2_JAZZY).generate_msgdef(name, ros_version=2)[0]
+    text = message_types(Stores.ROS2_JAZZY).generate_msgdef(name, ros_version=2)[0]
     if connection.msgdef.format == MessageDefinitionFormat.MSG:
         text = connection.msgdef.data
     return lambda data: read_ros2(name, data, text.encode())
 
 
+def ros1_types(path: Path, connection: Connection) -> Typestore:
+    """Return the types of ROS 1; refuse a bag with another definition of the type of a connection."""
+    store, name = message_types(Stores.ROS1_NOETIC), connection.msgtype
+    if connection.digest != store.generate_msgdef(name)[1]:
+        raise IpsysError(f"{path}: {connection.topic}: its type {name} is not the one of ROS 1")
+    return store
+
+
 @cache
-def _store(version: Stores) -> Typestore:
-    return get_typestore(version)
+def message_types(version: Stores) -> Typestore:
+    """Return the types of a version of ROS, with the transforms that the library lacks for ROS 1."""
+    store = get_typestore(version)
+    for name in ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage") if version is Stores.ROS1_NOETIC else ():
+        store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", name))
+    return store
 
 
 def _read_ros1(path: Path, store: Typestore, name: str, data: bytes) -> SimpleNamespace:
     """Return a message with the names of ROS 2: ROS 1 writes the matrices of intrinsics in capitals."""
-    with _faults(path):
+    with faults(path):
         message = store.deserialize_ros1(data, name)
     return SimpleNamespace(**{name.lower(): getattr(message, name) for name in message.__dataclass_fields__})  # type: ignore[attr-defined]
 

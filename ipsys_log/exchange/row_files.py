@@ -57,6 +57,16 @@ def read_cells(path: Path) -> Iterator[tuple[int, list[str]]]:
             yield table.line_num, cells
 
 
+def find_delimiter(line: str) -> str:
+    """Return the separator of the cells of a line; spreadsheets in many languages do not use commas."""
+    return next((mark for mark in (";", "\t") if mark in line), ",")
+
+
+def with_decimal_point(text: str) -> str:
+    """Return a number with a decimal point instead of its decimal comma."""
+    return text.replace(",", ".") if text.count(",") == 1 and "." not in text else text
+
+
 class NamedRow(NamedTuple):
     """A row of a file: its place in errors, and its cells by the names of the columns."""
 

@@ -97,6 +97,7 @@ EVALUATION = Channel(name="evaluation", topic="/runs/{run}/evaluation", payloads
 POSITIONS = Channel(name="positions", topic="/runs/{run}/cameras/{camera}/positions", payloads=(Positions,))
 TRACKS = Channel(name="tracks", topic="/runs/{run}/tracks", payloads=(Tracks,))
 SMOOTHED_TRACKS = Channel(name="smoothed_tracks", topic="/runs/{run}/smoothed_tracks", payloads=(Tracks,))
+ESTIMATE = Channel(name="estimate", topic="/runs/{run}/estimate", payloads=(Tracks,))
 POSES = Channel(name="poses", topic="/runs/{run}/poses", payloads=(FrameTransforms,))
 # The only channel that several stages of a run write.
 RUN_EVENTS = Channel(name="run_events", topic="/runs/{run}/events", payloads=(Event,))
@@ -104,7 +105,7 @@ RUN_EVENTS = Channel(name="run_events", topic="/runs/{run}/events", payloads=(Ev
 CHANNELS: tuple[Channel, ...] = (
     *(RIG, IMAGES, CALIBRATIONS, CLOCKS, MEASUREMENTS, EVENTS, LATENCY, TRUTH, PATHS, COMMANDS, CUTS, MERGES),
     *(RECORD, MARKERS, ANNOTATIONS, CAMERA_POINTS, MODEL, EVALUATION, POSITIONS, TRACKS, POSES),
-    *(SMOOTHED_TRACKS, RUN_EVENTS),
+    *(SMOOTHED_TRACKS, ESTIMATE, RUN_EVENTS),
 )
 
 RIG_TOPIC = RIG.topic

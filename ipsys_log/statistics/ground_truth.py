@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.messages import Array, ErrorStatistics, Indices, Message, Tracks
+from ipsys_log.messages import Array, ErrorStatistics, Indices, Mask, Message, Tracks
 from ipsys_log.statistics.accuracy import error_statistics
 from ipsys_log.statistics.calibration_points import TimedPoints, still_interval
 from ipsys_log.statistics.tape import RiggedMeasurement
@@ -164,12 +164,14 @@ class RelativeErrors(NamedTuple):
     """The relative pose error over a distance or a time.
 
     ``relation`` is ``translation_part``, which needs headings, or ``point_distance``. ``errors_m`` is (n,).
+    ``errors_rad`` (n,) are those of the rotation about z; None without headings.
     """
 
     delta: float
     unit: str
     relation: str
     errors_m: Array
+    errors_rad: Array | None = None
 
     @property
     def summary(self) -> ErrorStatistics:
@@ -196,6 +198,26 @@ class TrajectoryErrors(NamedTuple):
     def absolute_2d(self) -> ErrorStatistics:
         """The absolute trajectory error (ATE) on the floor."""
         return error_statistics(np.linalg.norm(self.offsets_m[:, :2], axis=1), independent=False)
+
+
+class PosePairs(NamedTuple):
+    """Poses of a trajectory and the true ones at the same n instants; headings (n,) are NaN where unknown."""
+
+    times_ns: NDArray[np.int64]
+    points_m: Array
+    headings_rad: Array
+    true_m: Array
+    true_rad: Array
+
+    @property
+    def has_headings(self) -> Mask:
+        """The instants with both headings (n,)."""
+        return np.isfinite(self.headings_rad) & np.isfinite(self.true_rad)
+
+    def part(self, rows: Mask | Indices) -> "PosePairs":
+        """Return the pairs of some instants."""
+        others = (self.points_m, self.headings_rad, self.true_m, self.true_rad)
+        return PosePairs(self.times_ns[rows], *(values[rows] for values in others))
 
 
 def trajectory_errors(
@@ -243,47 +265,59 @@ def _errors_of(track: TrackedPath, truth: TrackedPath) -> TrajectoryErrors | Non
     if not is_known.any():
         return None
     rows = rows[is_known]
-    points_m, headings_rad = track.positions.points_m[rows], track.headings_rad[rows]
-    times_ns, true_m = times_ns[is_known], brackets.mix(truth.positions.points_m)[is_known]
-    true_rad = _mix_headings(brackets, truth.headings_rad)[is_known]
-    has_headings = np.isfinite(headings_rad) & np.isfinite(true_rad)
-    used = has_headings if has_headings.any() else np.ones(len(times_ns), dtype=np.bool_)
-    relative = _relative_errors(
-        times_ns[used],
-        (points_m[used], true_m[used]),
-        (headings_rad[used], true_rad[used]) if has_headings.any() else None,
+    pairs = PosePairs(
+        times_ns[is_known],
+        track.positions.points_m[rows],
+        track.headings_rad[rows],
+        brackets.mix(truth.positions.points_m)[is_known],
+        _mix_headings(brackets, truth.headings_rad)[is_known],
     )
-    return TrajectoryErrors(track.robot, points_m - true_m, tuple(relative))
+    return TrajectoryErrors(track.robot, pairs.points_m - pairs.true_m, tuple(relative_errors(pairs)))
 
 
 def _mix_headings(brackets: TimeBrackets, known_rad: Array) -> Array:
     """Return headings (k,) between those of the truth (n,), along the shorter arc; NaN if unknown."""
     start_rad, end_rad = known_rad[brackets.before], known_rad[brackets.after]
-    arc_rad = (end_rad - start_rad + np.pi) % (2 * np.pi) - np.pi
-    return np.asarray(start_rad + brackets.share * arc_rad)
+    return np.asarray(start_rad + brackets.share * wrap_angles(end_rad - start_rad))
 
 
-def _relative_errors(
-    times_ns: NDArray[np.int64],
-    points_m: tuple[Array, Array],
-    headings_rad: tuple[Array, Array] | None,
+def wrap_angles(angles_rad: Array) -> Array:
+    """Return angles between -pi and pi."""
+    return np.asarray((angles_rad + np.pi) % (2 * np.pi) - np.pi)
+
+
+def relative_errors(
+    pairs: PosePairs, deltas: Sequence[tuple[float, str]] = DELTAS, share: float = _DISTANCE_SHARE
 ) -> list[RelativeErrors]:
-    steps_m = np.linalg.norm(np.diff(points_m[1], axis=0), axis=1)
-    passed = {"m": np.append(0.0, np.cumsum(steps_m)), "s": (times_ns - times_ns[0]) / NS_PER_S}
+    """Return the relative pose errors over distances and times; none for one that no two instants have.
+
+    With headings, only the instants with a heading count. A pair is within ``share`` of a distance.
+    """
+    has_headings = pairs.has_headings
+    if is_turned := bool(has_headings.any()):
+        pairs = pairs.part(has_headings)
+    steps_m = np.linalg.norm(np.diff(pairs.true_m, axis=0), axis=1)
+    passed = {
+        "m": np.append(0.0, np.cumsum(steps_m)),
+        "s": (pairs.times_ns - pairs.times_ns[0]) / NS_PER_S,
+    }
     intervals_s = np.diff(passed["s"])
     half_s = _INTERVAL_SHARE * float(np.median(intervals_s)) if len(intervals_s) else 0.0
     found = []
-    for delta, unit in DELTAS:
-        start, end = pairs_at(passed[unit], delta, half_s if unit == "s" else _DISTANCE_SHARE * delta)
+    for delta, unit in deltas:
+        start, end = pairs_at(passed[unit], delta, half_s if unit == "s" else share * delta)
         if len(start):
-            moves_m = [rows[end] - rows[start] for rows in points_m]
-            if headings_rad is None:
+            moves_m = [rows[end] - rows[start] for rows in (pairs.points_m, pairs.true_m)]
+            if not is_turned:
                 lengths_m = [np.linalg.norm(move_m, axis=1) for move_m in moves_m]
                 found.append(RelativeErrors(delta, unit, DISTANCE, np.abs(lengths_m[0] - lengths_m[1])))
                 continue
+            headings_rad = pairs.headings_rad, pairs.true_rad
             own_m = [_turned_back(m, rad[start]) for m, rad in zip(moves_m, headings_rad, strict=True)]
             errors_m = np.linalg.norm(own_m[0] - own_m[1], axis=1)
-            found.append(RelativeErrors(delta, unit, TRANSLATION, errors_m))
+            turns_rad = [rad[end] - rad[start] for rad in headings_rad]
+            errors_rad = np.abs(wrap_angles(turns_rad[0] - turns_rad[1]))
+            found.append(RelativeErrors(delta, unit, TRANSLATION, errors_m, errors_rad))
     return found
 
 

@@ -3,8 +3,8 @@
 The speed of a body does not depend on the coordinates. So the time offset is found before the alignment.
 """
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,8 @@ _JUMP = 10.0
 _LEAST_JUMP_M = 0.01
 # and needs a larger acceleration than a robot has.
 _LARGEST_ACCELERATION_M_S2 = 10.0
+# A single jump bends each of its neighbours by half. This share of it is asked for.
+_BEND_BACK = 0.25
 # Each pass removes only the largest of neighbouring jumps.
 _PASSES = 4
 
@@ -59,30 +61,39 @@ class CommonInstants(NamedTuple):
     block: NDArray[np.int64]
 
 
-def without_jumps(pair: PathPair) -> PathPair:
-    """Return a pair without the true positions that jump away from both neighbours and back.
+def jumps(times_s: Array, points_m: Array) -> Mask:
+    """Return the positions (n,) that jump away from both neighbours and back.
 
     An interpolation beside a jump has a wrong velocity, which a time offset would follow.
     """
-    times_s, points_m = pair.true_s, pair.true_m
+    kept = np.arange(len(times_s))
     limit_s = gap_limit_s(times_s)
     for _ in range(_PASSES):
-        if len(times_s) < 5:
+        if len(kept) < 5:
             break
-        steps_s = np.diff(times_s)
+        steps_s, points = np.diff(times_s[kept]), points_m[kept]
         beside = (steps_s[:-1] <= limit_s) & (steps_s[1:] <= limit_s)
-        between_m = points_m[:-2] + (steps_s[:-1] / (steps_s[:-1] + steps_s[1:]))[:, None] * (
-            points_m[2:] - points_m[:-2]
+        between_m = points[:-2] + (steps_s[:-1] / (steps_s[:-1] + steps_s[1:]))[:, None] * (
+            points[2:] - points[:-2]
         )
-        apart_m = np.zeros(len(times_s))
-        apart_m[1:-1] = np.where(beside, np.linalg.norm(points_m[1:-1] - between_m, axis=1), 0.0)
+        bends_m = np.zeros_like(points)
+        bends_m[1:-1] = np.where(beside[:, None], points[1:-1] - between_m, 0.0)
+        apart_m = np.linalg.norm(bends_m, axis=1)
+        # Beside a jump, the path bends back on both sides. At a step, it does so on one side; where a robot
+        # starts or stops, on none.
+        none_m = np.zeros((1, bends_m.shape[1]))
+        beside_m = np.concatenate([bends_m[1:], none_m]), np.concatenate([none_m, bends_m[:-1]])
+        limits_m2 = -_BEND_BACK * apart_m**2
+        bends_back = np.logical_and.reduce([(one * bends_m).sum(axis=1) < limits_m2 for one in beside_m])
         # A jump moves the middle of its neighbours, too: only the largest of three is removed.
         largest = apart_m >= np.maximum(np.append(apart_m[1:], 0.0), np.append(0.0, apart_m[:-1]))
-        kept = ~(largest & (apart_m > _longest_step_m(apart_m, steps_s)))
-        if kept.all():
+        good = ~(largest & bends_back & (apart_m > _longest_step_m(apart_m, steps_s)))
+        if good.all():
             break
-        times_s, points_m = times_s[kept], points_m[kept]
-    return pair._replace(true_s=times_s, true_m=points_m)
+        kept = kept[good]
+    found = np.ones(len(times_s), dtype=np.bool_)
+    found[kept] = False
+    return found
 
 
 def _longest_step_m(apart_m: Array, steps_s: Array) -> float:
@@ -98,32 +109,48 @@ def common_instants(pairs: Sequence[PathPair], offset_s: float) -> CommonInstant
     """
     parts: list[tuple[Array, Array, Array, Array]] = []
     for number, pair in enumerate(pairs):
-        true_m, velocity_m_s, known = _interpolate(pair.true_s, pair.true_m, pair.track_s - offset_s)
+        true_m, velocity_m_s, known = Spline.through(pair.true_s, pair.true_m).at(pair.track_s - offset_s)
         blocks = np.floor(pair.track_s[known] / _BLOCK_S) * len(pairs) + number
         parts.append((pair.track_m[known], true_m[known], velocity_m_s[known], blocks))
     track_m, true_m, velocity_m_s, block = (np.concatenate(part) for part in zip(*parts, strict=True))
     return CommonInstants(track_m, true_m, velocity_m_s, block.astype(np.int64))
 
 
-def _interpolate(times_s: Array, points_m: Array, at_s: Array) -> tuple[Array, Array, Mask]:
-    """Return points and velocities (k, 3) at times (k,) by cubic Hermite splines, and a mask of the known."""
-    if len(times_s) < 2:
-        return np.zeros((len(at_s), 3)), np.zeros((len(at_s), 3)), np.zeros(len(at_s), dtype=np.bool_)
-    limit_s = gap_limit_s(times_s)
-    brackets = bracket_times(times_s, at_s, limit_s)
-    after = brackets.before.clip(max=len(times_s) - 2) + 1
-    start_s, step_s = times_s[after - 1], times_s[after] - times_s[after - 1]
-    velocities = _velocities(times_s, points_m, limit_s)
-    u, h = ((at_s - start_s) / step_s)[:, None], step_s[:, None]
-    p, q, v, w = points_m[after - 1], points_m[after], velocities[after - 1] * h, velocities[after] * h
-    # The cubic with these ends p, q and slopes v, w, by powers of u.
-    second, third = 3 * (q - p) - 2 * v - w, 2 * (p - q) + v + w
-    value_m = p + u * (v + u * (second + u * third))
-    return value_m, (v + u * (2 * second + 3 * u * third)) / h, brackets.is_known & (step_s <= limit_s)
+class Spline(NamedTuple):
+    """A path as a cubic Hermite spline: times (n,) in s, values (n, c), and their slopes (n, c)."""
+
+    times_s: Array
+    values: Array
+    slopes: Array
+    limit_s: float
+
+    @classmethod
+    def through(cls, times_s: Array, values: Array) -> Self:
+        """Return the spline through values (n, c), with gaps where times are far apart."""
+        limit_s = gap_limit_s(times_s)
+        return cls(times_s, values, _velocities(times_s, values, limit_s), limit_s)
+
+    def at(self, at_s: Array) -> tuple[Array, Array, Mask]:
+        """Return values and slopes (k, c) at times (k,), and a mask of the known ones."""
+        times_s, values, slopes, limit_s = self
+        if len(times_s) < 2:
+            nothing = np.zeros((len(at_s), values.shape[1]))
+            return nothing, nothing, np.zeros(len(at_s), dtype=np.bool_)
+        brackets = bracket_times(times_s, at_s, limit_s)
+        after = brackets.before.clip(max=len(times_s) - 2) + 1
+        start_s, step_s = times_s[after - 1], times_s[after] - times_s[after - 1]
+        u, h = ((at_s - start_s) / step_s)[:, None], step_s[:, None]
+        p, q, v, w = values[after - 1], values[after], slopes[after - 1] * h, slopes[after] * h
+        # The cubic with these ends p, q and slopes v, w, by powers of u.
+        second, third = 3 * (q - p) - 2 * v - w, 2 * (p - q) + v + w
+        value = p + u * (v + u * (second + u * third))
+        return value, (v + u * (2 * second + 3 * u * third)) / h, brackets.is_known & (step_s <= limit_s)
 
 
 def _velocities(times_s: Array, points_m: Array, limit_s: float) -> Array:
-    """Return central differences (n, 3) in m/s; at the border of a gap, the difference on its other side."""
+    """Return central differences (n, c) per s; at the border of a gap, the difference on its other side."""
+    if len(times_s) < 2:
+        return np.zeros_like(points_m)
     steps_s = np.diff(times_s)
     slopes = np.diff(points_m, axis=0) / steps_s[:, None]
     weights = np.where(steps_s <= limit_s, steps_s, 1e-12)[:, None]
@@ -132,6 +159,63 @@ def _velocities(times_s: Array, points_m: Array, limit_s: float) -> Array:
     )
     total = np.concatenate([[[0.0]], weights]) + np.concatenate([weights, [[0.0]]])
     return np.asarray(rows / total)
+
+
+# The other path is smoothed over 4 steps: its noise would be taken for motion. A cubic stays as it is.
+_SMOOTH_STEP_S = 0.025
+
+
+class Body(NamedTuple):
+    """A robot in both systems, each in s since an own zero.
+
+    Attributes
+    ----------
+    track_s, track_m, heading_rad : (n,), (n, 3), (n,) of the marker in the lab; NaN without a heading.
+    other_s, other_m : (k,), (k, 3) of the other body.
+    axes : (k, 3, 3), rotations from the other body to its coordinates; NaN where they are unknown.
+    spline : positions and rotations of the other body, (k, 12).
+    """
+
+    track_s: Array
+    track_m: Array
+    heading_rad: Array
+    other_s: Array
+    other_m: Array
+    axes: Array
+    spline: Spline
+
+    def with_axes(self, axes: Array) -> Self:
+        """Return the body with other rotations (k, 3, 3)."""
+        spline = Spline.through(self.other_s, np.concatenate([self.other_m, axes.reshape(-1, 9)], axis=1))
+        return self._replace(axes=axes, spline=spline)
+
+
+def thin(bodies: Sequence[Body], most: int) -> list[Body]:
+    """Return bodies with at most so many instants of their tracks, together."""
+    every = -(-sum(len(body.track_s) for body in bodies) // most)
+    return [
+        body._replace(
+            track_s=body.track_s[::every],
+            track_m=body.track_m[::every],
+            heading_rad=body.heading_rad[::every],
+        )
+        for body in bodies
+    ]
+
+
+def smooth_values(spline: Spline, at_s: Array) -> tuple[Array, Array, Mask]:
+    """Return smoothed values (n, c), their exact slopes, and which are known.
+
+    References
+    ----------
+    Weights of a cubic over five points: Savitzky and Golay, Analytical Chemistry 1964, table I.
+    """
+    places_s = at_s[None] + _SMOOTH_STEP_S * np.arange(-2.0, 3.0)[:, None]
+    value, slope, known = spline.at(places_s.ravel())
+    weights = np.array([-3.0, 12.0, 17.0, 12.0, -3.0]) / 35
+    shape = (5, len(at_s), -1)
+    value, slope = (np.tensordot(weights, rows.reshape(shape), 1) for rows in (value, slope))
+    return value, slope, np.asarray(known.reshape(5, -1).all(axis=0))
 
 
 # Half the time over which a speed is measured. Noise of 5 mm then is a speed of 0.035 m/s.
@@ -164,34 +248,65 @@ def search_offsets_s(pairs: Sequence[PathPair]) -> list[float]:
     Masked correlation: Padfield, "Masked object registration in the Fourier domain", IEEE Transactions on
     Image Processing 2012, eq. (23).
     """
-    steps = [
-        float(np.median(np.diff(t))) for pair in pairs for t in (pair.true_s, pair.track_s) if len(t) > 1
-    ]
+    return _search_s([(pair.true_s, pair.true_m, pair.track_s, pair.track_m) for pair in pairs], _speeds)
+
+
+def search_turns_s(pairs: Sequence[tuple[Array, Array, Array, Array]]) -> list[float]:
+    """Return time offsets like :func:`search_offsets_s`, by the agreement of turn rates.
+
+    Turn rates depend neither on the coordinates nor on the place of the marker on its robot, and a
+    dead-reckoned path has them right.
+
+    Parameters
+    ----------
+    pairs : by robot the times (n,) in s and continuous headings (n,) in rad of the other recording, and those
+        of the track, (m,) and (m,).
+    """
+    return _search_s([(a_s, a[:, None], b_s, b[:, None]) for a_s, a, b_s, b in pairs], _turn_rates)
+
+
+_Signal = Callable[[Array, Array, float], tuple[Array, Array]]
+
+
+def _search_s(pairs: Sequence[tuple[Array, Array, Array, Array]], signal: _Signal) -> list[float]:
+    steps = [float(np.median(np.diff(t))) for pair in pairs for t in (pair[0], pair[2]) if len(t) > 1]
     if not steps:
         return []
-    longest_s = max(float(times[-1]) for pair in pairs for times in (pair.true_s, pair.track_s))
+    longest_s = max(float(times[-1]) for pair in pairs for times in (pair[0], pair[2]))
     step_s = float(np.clip(max(steps), _SHORTEST_STEP_S, _LONGEST_STEP_S))
     step_s = max(step_s, longest_s / _MOST_STEPS)
     size = 2 * (int(longest_s / step_s) + 2)
     sums = np.zeros((6, size))
-    for pair in pairs:
-        sums += _correlation_sums(
-            _speeds(pair.true_s, pair.true_m, step_s), _speeds(pair.track_s, pair.track_m, step_s), size
-        )
+    for true_s, true, track_s, track in pairs:
+        sums += _correlation_sums(signal(true_s, true, step_s), signal(track_s, track, step_s), size)
     return _peaks_s(_scores(sums), step_s)
 
 
 def _speeds(times_s: Array, points_m: Array, step_s: float) -> tuple[Array, Array]:
     """Return speeds on the floor at the steps of a grid, with 0 where they are unknown, and a mask 0 or 1."""
-    half_s = max(_HALF_WINDOW_S, step_s)
-    grid_s: Array = np.arange(int(times_s[-1] / step_s) + 1, dtype=np.float64) * step_s
-    ends = [bracket_times(times_s, grid_s + sign * half_s, gap_limit_s(times_s)) for sign in (-1, 1)]
-    before_m, after_m = (end.mix(points_m[:, :2]) for end in ends)
-    speeds = np.linalg.norm(after_m - before_m, axis=1) / (2 * half_s)
-    known = ends[0].is_known & ends[1].is_known
+    changes_m, known, span_s = _changes(times_s, points_m[:, :2], step_s)
+    speeds = np.linalg.norm(changes_m, axis=1) / span_s
     if known.any():
         speeds = np.minimum(speeds, _CLIPPED_ABOVE * np.quantile(speeds[known], 0.9))
     return np.where(known, speeds, 0.0), known.astype(np.float64)
+
+
+def _turn_rates(times_s: Array, headings_rad: Array, step_s: float) -> tuple[Array, Array]:
+    """Return turn rates like :func:`_speeds`."""
+    changes, known, span_s = _changes(times_s, headings_rad, step_s)
+    rates = changes[:, 0] / span_s
+    if known.any():
+        limit = _CLIPPED_ABOVE * float(np.quantile(np.abs(rates[known]), 0.95))
+        rates = np.clip(rates, -limit, limit)
+    return np.where(known, rates, 0.0), known.astype(np.float64)
+
+
+def _changes(times_s: Array, values: Array, step_s: float) -> tuple[Array, Mask, float]:
+    half_s = max(_HALF_WINDOW_S, step_s)
+    grid_s: Array = np.arange(int(times_s[-1] / step_s) + 1, dtype=np.float64) * step_s
+    ends = [bracket_times(times_s, grid_s + sign * half_s, gap_limit_s(times_s)) for sign in (-1, 1)]
+    before, after = (end.mix(values) for end in ends)
+    return after - before, ends[0].is_known & ends[1].is_known, 2 * half_s
 
 
 def _correlation_sums(true: tuple[Array, Array], track: tuple[Array, Array], size: int) -> Array:

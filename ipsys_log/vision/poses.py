@@ -56,6 +56,19 @@ def rotation_vector(rotation_matrix: Array) -> Array:
     return np.asarray(cv2.Rodrigues(rotation_matrix)[0], dtype=np.float64).ravel()
 
 
+def rotation_between(from_m: Array, to_m: Array) -> tuple[Array, float]:
+    """Return the best rotation (d, d) and scale from points (n, d) to others, both around 0.
+
+    References
+    ----------
+    Umeyama, IEEE PAMI 1991, eq. (40) to (42).
+    """
+    left, sizes, right = np.linalg.svd(to_m.T @ from_m)
+    signs = np.ones(len(sizes))
+    signs[-1] = np.sign(np.linalg.det(left) * np.linalg.det(right))
+    return (left * signs) @ right, float((sizes * signs).sum() / (from_m**2).sum())
+
+
 def pose_facing_up(x_m: float, y_m: float, z_m: float, heading_rad: float) -> Array:
     """Return ``world_from_marker``, (4, 4), of a marker that faces up.
 

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import copy
 import io
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+from evo.core import lie_algebra as lie
 from evo.core import metrics
 from evo.core.trajectory import PosePath3D
 from evo.core.units import Unit
 from rich.console import Console
+from scipy.optimize import minimize_scalar
+from scipy.spatial.transform import Rotation
 
 import ipsys_log as ipsys
 from ipsys_log.app.report.accuracy import Accuracy, accuracy_json, read_accuracy
@@ -20,9 +24,11 @@ from ipsys_log.app.report.tables import trajectory_table
 from ipsys_log.engine.output import append_messages
 from ipsys_log.engine.provenance import Outcome
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import TRUTH_TOPIC, ErrorStatistics, Message
+from ipsys_log.messages import TRUTH_TOPIC, Array, ErrorStatistics, Message
 from ipsys_log.messages.channels import TRACKS
+from ipsys_log.models.tracking.track_messages import gather_rows
 from ipsys_log.statistics.accuracy import root_mean_square_m
+from ipsys_log.statistics.estimate_scores import EstimateFrame, score_estimate
 from ipsys_log.statistics.ground_truth import TrajectoryErrors, gather_paths, pairs_at, trajectory_errors
 from ipsys_log.units import NS_PER_S
 from tests.exchange.driven_lab import ROBOTS, START_NS, instants_ns, path_of, tracked, write_lab
@@ -99,6 +105,77 @@ def test_trajectory_errors_are_those_of_evo(log: Path, tmp_path: Path) -> None:
             )
             relative.process_data((truth, track))
             assert_same(one.summary, relative)
+
+
+def test_scores_of_an_estimate_are_those_of_evo(log: Path, tmp_path: Path) -> None:
+    """The tracks are scored as an estimate in its own coordinates and scale, against the ground truth."""
+    yaw_rad, shift_m, scale = 2.2, np.array([1.0, -2.0, 0.3]), 1.25
+    frame = EstimateFrame(yaw_rad, shift_m, scale, np.zeros(3), 0.0)
+    own_from_lab = lie.se3_inverse(lie.se3(Rotation.from_rotvec([0, 0, yaw_rad]).as_matrix(), shift_m))
+    with Session([log]) as session:
+        estimate, true = (
+            gather_rows(session.messages(topics), "ada")[0]
+            for topics in (session.topics(TRACKS, "poly"), [TRUTH_TOPIC])
+        )
+    # Without a movement in z, a mirrored fit would be as good.
+    wave_m = np.outer(np.sin(np.arange(len(true.times_ns)) / 10), [0.0, 0.0, 0.1])
+    for rows in (estimate, true):
+        rows.points_m[:] += wave_m
+    score = score_estimate(estimate, true, frame, True, "ada.tum")
+    truth, lab, has_headings = evo_paths(log, tmp_path, "ada")
+    truth, lab = (
+        PosePath3D(path.positions_xyz + wave_m, path.orientations_quat_wxyz) for path in (truth, lab)
+    )
+    lab.transform(own_from_lab)
+    lab.scale(1 / scale)
+    kinds = ["none", *["first_pose"] * has_headings, "yaw", "se3", "sim3"]
+    assert [row.alignment for row in score.aligned] == kinds
+    for row in score.aligned:
+        own = copy.deepcopy(lab)
+        if row.alignment == "yaw":
+            assert_least(row.points_m, truth.positions_xyz, own.positions_xyz)
+            continue
+        if row.alignment == "first_pose":
+            own.align_origin(truth)
+        elif row.alignment != "none":
+            own.align(truth, correct_scale=row.alignment == "sim3")
+        assert np.allclose(row.points_m, own.positions_xyz, atol=1e-9), row.alignment
+        absolute = metrics.APE(metrics.PoseRelation.translation_part)
+        absolute.process_data((truth, own))
+        assert_same(row.errors.absolute_3d, absolute)
+        if has_headings:
+            turned = metrics.APE(metrics.PoseRelation.rotation_angle_rad)
+            turned.process_data((truth, own))
+            # Tracks have headings alone, so the tilt of a fit in space is in the rotations of evo only.
+            tilt_rad = 1e-4 if row.alignment in ("se3", "sim3") else 1e-6
+            assert np.abs(row.turns_rad) == pytest.approx(turned.error, abs=tilt_rad), row.alignment
+    for one, (delta, unit) in zip(score.relative, [(1.0, Unit.meters), (30, Unit.frames)], strict=True):
+        relations = {one.relation.replace("_", " "): one.errors_m}
+        if one.errors_rad is not None:
+            relations["rotation angle in radians"] = one.errors_rad
+        for relation, errors in relations.items():
+            relative = metrics.RPE(
+                metrics.PoseRelation(relation),
+                *(delta, unit),
+                rel_delta_tol=0.1,
+                all_pairs=True,
+                pairs_from_reference=True,
+            )
+            relative.process_data((truth, own))
+            assert errors == pytest.approx(relative.error, abs=1e-6), relation
+
+
+def assert_least(aligned_m: Array, true_m: Array, own_m: Array) -> None:
+    """Check the least squares of yaw and translation, which evo lacks, by a search over the yaw."""
+
+    def squares(yaw_rad: float) -> float:
+        turned_m = Rotation.from_rotvec([0, 0, yaw_rad]).apply(own_m)
+        apart_m = turned_m - true_m
+        return float(((apart_m - apart_m.mean(axis=0)) ** 2).sum())
+
+    starts = np.linspace(-np.pi, np.pi, 9)
+    least = min(minimize_scalar(squares, bracket=(start, start + 0.1)).fun for start in starts)
+    assert ((aligned_m - true_m) ** 2).sum() == pytest.approx(least, rel=1e-9)
 
 
 def test_api_has_ate_and_rpe_as_evo_computes_them(log: Path, tmp_path: Path) -> None:

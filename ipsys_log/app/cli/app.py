@@ -58,7 +58,7 @@ _FIRST: dict[str, dict[str, str]] = {
 }
 # Each of these groups has one line there.
 _FURTHER: dict[str, tuple[str, ...]] = {
-    "Accuracy": ("exclude", "drift"),
+    "Accuracy": ("exclude", "drift", "compare"),
     "Logs": ("check", "cat", "stream", "cut", "merge", "verify", "repair"),
     "Datasets": ("catalogue", "pack", "score"),
     "Other hosts": ("node",),
@@ -70,6 +70,7 @@ _MODULES: dict[str, tuple[str, ...]] = {
     "batch": ("batch",),
     "calibrate": ("calibrate",),
     "calibrate_lab": ("calibrate-lab",),
+    "compare": ("compare",),
     "camera_poses": ("align", "drift"),
     "datasets": ("catalogue", "pack", "score"),
     "imports": ("import",),

@@ -26,8 +26,8 @@ _SOURCES = Annotated[
     typer.Argument(
         metavar="SOURCE",
         help="A folder with a sub-folder of images per camera; a video of each camera (red=red.mp4); a bag "
-        "of ROS 1 (.bag) or ROS 2 (a folder or a .db3 file); a table (.csv); trajectories (.tum); or the "
-        "folder of the paper's data.",
+        "of ROS 1 (.bag) or ROS 2 (a folder or a .db3 file); a table (.csv); trajectories (.tum, .tsv, .trc, "
+        ".c3d); or the folder of the paper's data.",
     ),
 ]
 _NEW_LOG = log_option(help="The log to write. Without --into, tables need --rig, too.")
@@ -55,7 +55,8 @@ _OPTIONS: dict[str, cli.Option] = {
     ),
     "robot": option(
         list[str] | None, "--robot", "NAME",
-        "The robot of a trajectory that names none; repeat it in the order of the files.",
+        "The robot of a trajectory that names none; repeat it in the order of the files. NAME=BODY selects a "
+        "body of a file, a topic of a bag, or frames: ada=/tf:map.base_link.",
     ),
     "run": option(
         str | None, "--run", "NAME",
@@ -70,11 +71,15 @@ _OPTIONS: dict[str, cli.Option] = {
     "time_offset": option(
         str | None, "--time-offset", "S", "For truth: add this to the times, instead of an estimate."
     ),
+    "pivot": option(
+        str | None, "--pivot", "X,Y,Z",
+        "For truth: from the marker to the body in m, in the axes of the marker, instead of an estimate.",
+    ),
     "time_unit": option(
-        str | None, "--time-unit", "s|ns", "Unit of a time column whose header has none."
+        str | None, "--time-unit", "s|ms|us|ns", "Unit of a time column whose header has none."
     ),
     "length_unit": option(
-        str | None, "--length-unit", "m|mm", "Unit of x, y and z whose header has none."
+        str | None, "--length-unit", "m|cm|mm", "Unit of x, y and z whose header has none."
     ),
     "as_json": (cli.AsJson, False),
 }  # fmt: skip
@@ -117,9 +122,11 @@ def import_(sources: list[Path], output: Path | None, kind: str | None, **option
         ipsys import lab.bag -o lab.mcap                    # a ROS bag
         ipsys import vicon.csv --into monday.mcap           # ground truth
     """
-    for source in sources:
+    for source in sources if kind != "truth" else ():
         _refuse_log(Path(str(source).rpartition("=")[2]))
     kind = kind or _find_kind(sources[0])
+    if kind == "ros" and options["into"] and not output:
+        kind = "truth"  # a bag with images becomes a new log
     if kind not in KINDS:
         raise IpsysError(f"--as {kind}: is not a kind of source; use one of {', '.join(KINDS)}")
     _import_as(kind, sources, output, options)
@@ -158,7 +165,7 @@ def _find_kind(source: Path) -> str:
         with source.open("rb") as file:
             header = file.readline(_LONGEST_HEADER)
         return "pairs" if b"xc_m" in header else "detections" if b"x0_px" in header else "truth"
-    if suffix == ".tum":
+    if suffix in (".tum", ".tsv", ".trc", ".c3d", ".txt", ".dat"):
         return "truth"
     raise IpsysError(
         f"{source}: its kind is not known; name it with --as, or a video as camera={source.name}"
@@ -238,25 +245,29 @@ def _import_truth(
     run: str | None,
     align: str | None,
     time_offset: str | None,
+    pivot: str | None,
     time_unit: str | None,
     length_unit: str | None,
     rig: Path | None,
     as_json: bool,
 ) -> None:
     from ipsys_log.app.report.truth_import import truth_json, truth_lines
-    from ipsys_log.exchange.ground_truth_files import TruthUnits, parse_offset
     from ipsys_log.exchange.import_truth import TruthOptions, import_truth
+    from ipsys_log.exchange.trajectory_columns import GivenUnits
+    from ipsys_log.exchange.trajectory_tables import parse_offset, parse_pivot
     from ipsys_log.messages.rig_file import load_rig
 
     options = TruthOptions(
         tuple(robot or ()),
-        TruthUnits(time_unit, length_unit),
+        GivenUnits(time_unit, length_unit),
         align or "2d",
         None if time_offset is None else parse_offset(time_offset),
+        None if pivot is None else parse_pivot(pivot),
         run,
         load_rig(rig) if rig else None,
     )
-    imported = import_truth(sources, into, output, options)
+    with progress_bar(("bag",)) as progress:
+        imported = import_truth(sources, into, output, options, say, progress)
     print_result(truth_json(imported), truth_lines(imported), as_json)
     say(f"results are in {imported.path}")
 

@@ -223,7 +223,8 @@ def export(
         setting(
             "--table",
             "NAME",
-            "tracks, positions, markers, camera_points, pairs, measurements, events, latency or truth.",
+            "tracks, positions, markers, camera_points, pairs, measurements, events, latency, truth "
+            "or estimate.",
         ),
     ] = "tracks",
     run: Annotated[

@@ -62,6 +62,8 @@ def intervals_table(found: list[dict[str, Any]]) -> Rows:
 
 # More cameras than these share one row, and more pairs of cameras than these are not shown.
 _MOST_CAMERAS, _MOST_PAIRS = 6, 10
+# The record of an import has more parameters; JSON has all.
+_MOST_PARAMETERS = 8
 # A camera with a smaller share of the usual number of messages has its own row.
 _USUAL_SHARE = 0.95
 # Messages of several cameras have no regular interval. On their channels, a gap is longer than this time.
@@ -326,6 +328,8 @@ def runs_table(runs: list[dict[str, Any]]) -> Rows:
     for run in runs:
         parameters = [f"{key}={value}" for key, value in run["parameters"].items()]
         parameters += [f"other {name}" for name in run["overrides"]]
+        if len(parameters) > _MOST_PARAMETERS:
+            parameters[_MOST_PARAMETERS:] = [f"{len(parameters) - _MOST_PARAMETERS} more"]
         count = sum(output["messages"] for output in run["outputs"])
         names = (run["run"], run["stage"], ", ".join(run["input_runs"]) or "-", ", ".join(parameters) or "-")
         version = run["fingerprint"].get("ipsys_log", "-")

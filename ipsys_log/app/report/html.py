@@ -11,6 +11,8 @@ from matplotlib.axes import Axes
 
 from ipsys_log.app.report import html_figures, html_sections
 from ipsys_log.app.report.accuracy import Accuracy, read_trajectories
+from ipsys_log.app.report.comparison import comparison_lines, comparison_table
+from ipsys_log.app.report.comparison_figures import comparison_pictures
 from ipsys_log.app.report.contents import runs_table, states_json
 from ipsys_log.app.report.figures import MOST_IN_LEGEND, new_figure, style_axes
 from ipsys_log.app.report.findings import Findings, gather_findings
@@ -35,6 +37,7 @@ from ipsys_log.statistics.cross_validation import FOLDS, REPEATS, SUBSETS
 from ipsys_log.statistics.disagreement import read_disagreement, reference_ids
 from ipsys_log.statistics.latency import latency_percentiles, step_times_s
 from ipsys_log.statistics.tape import RiggedMeasurement
+from ipsys_log.tools.comparison import read_comparisons
 from ipsys_log.tools.recording import CameraRecording, EventGroup, group_events, read_cameras
 from ipsys_log.units import NS_PER_S, format_bytes, format_duration, format_time
 
@@ -64,6 +67,7 @@ def render_report(session: Session, accuracies: Sequence[Accuracy]) -> str:
         **_figure_values(findings),
         **_overlap(session, findings),
         **_tracks(session),
+        **_estimates(session, findings),
         **_recording_values(session),
         **_provenance(session, findings),
         commands=_commands(session, findings),
@@ -161,6 +165,18 @@ def _tracks(session: Session) -> dict[str, Any]:
     }
 
 
+def _estimates(session: Session, findings: Findings) -> dict[str, Any]:
+    """Return the comparisons of estimates with tracks that the log stores; empty if it has no such tracks."""
+    try:
+        found = read_comparisons(session)
+    except IpsysError:  # a pack keeps the estimates, but not the tracks before they are computed again
+        found = []
+    return {
+        "estimates": [(comparison_table(one), [*comparison_lines(one)]) for one in found],
+        "estimates_pictures": comparison_pictures(found, findings.rig) if found else [],
+    }
+
+
 def _commands(session: Session, findings: Findings) -> dict[str, str]:
     """Return the commands that print or draw the content of the sections, by name."""
     logs = shell_words(*(path.name for path in session.paths))
@@ -172,6 +188,7 @@ def _commands(session: Session, findings: Findings) -> dict[str, str]:
         "errors": f"ipsys evaluate {logs}{models} --details",
         "plots": f"ipsys evaluate {logs}{models} --plot figures",
         "tracks": f"ipsys view {logs}",
+        "compare": f"ipsys compare {logs}",
         "info": f"ipsys info {logs}",
         "check": f"ipsys check {logs} --details",
         "latency": f"ipsys info --latency {logs} --plot latency.png",

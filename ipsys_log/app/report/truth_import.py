@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from ipsys_log.app.report.rows import cm, counted, mm, wrap_text
-from ipsys_log.exchange.import_truth import ImportedTruth
+from ipsys_log.exchange.import_truth import TEXTS, ImportedTruth
+from ipsys_log.statistics.path_alignment import BodyFrame
 from ipsys_log.units import NS_PER_S
 
 _MS_PER_S = 1000.0
@@ -21,14 +22,17 @@ def truth_lines(imported: ImportedTruth) -> Iterator[str]:
     yield wrap_text(f"Ground truth: {poses}.")
     found = imported.alignment
     offset = f"Time offset: {imported.time_offset_ns / NS_PER_S:.6f} s"
-    sigma_s = found.offset_sigma_s if found is not None else None
-    known = "given" if sigma_s is None else f"sigma {sigma_s * _MS_PER_S:.3f} ms"
+    sigma_s = math.nan if found is None else found.offset_sigma_s
+    known = f"sigma {sigma_s * _MS_PER_S:.3f} ms" if math.isfinite(sigma_s) else "given"
     yield wrap_text(f"{offset} ({known}), added to the times of the file.")
     align = imported.record.parameters["align"]
     if found is None or align == "none":
         yield "Alignment: none."
     else:
         yield wrap_text(f"Alignment {align}: {_motion_text(imported)}.")
+    if found is not None:
+        for robot, body in zip(found.names, found.bodies, strict=True):
+            yield wrap_text(_body_text(robot, body))
     if (residuals := imported.residuals) is not None:
         count = residuals.outliers
         outliers = f"; {counted(count, 'outlier')} not used for the estimate" if count else ""
@@ -38,6 +42,8 @@ def truth_lines(imported: ImportedTruth) -> Iterator[str]:
             f"{outliers}."
         )
     if found is not None:
+        for remark in found.remarks:
+            yield wrap_text(f"Remark: {remark}.")
         what = "offset" if align == "none" else "offset and alignment"
         yield wrap_text(
             f"Estimated from these tracks, {what} hide their constant errors: scores show the others only."
@@ -60,18 +66,33 @@ def _motion_text(imported: ImportedTruth) -> str:
     return ", ".join(parts)
 
 
+def _body_text(robot: str, body: BodyFrame) -> str:
+    """Return where the body of the other system is on its robot."""
+    pivot = ", ".join(
+        f"{name} {cm(value)} cm (sigma {mm(sigma)} mm)"
+        for name, value, sigma in zip("xyz", body.pivot_m, body.pivot_sigmas_m, strict=True)
+        if np.isfinite(sigma)
+    )
+    turn = f"turned by {math.degrees(body.turn_rad):.2f} deg" if np.isfinite(body.turn_sigma_rad) else ""
+    place = ", ".join(part for part in (pivot and f"from the marker to its origin: {pivot}", turn) if part)
+    return f"Body of {robot}: {place or 'its origin is taken as the marker'}."
+
+
 def truth_json(imported: ImportedTruth) -> dict[str, Any]:
     """Return the result as plain data, in SI units; the names are those of the record of the run."""
     numbers = {
         name: int(text) if text.isdigit() else float(text)
         for name, text in imported.record.parameters.items()
-        if name not in ("format", "files", "align")
+        if name not in TEXTS
     }
     summary: dict[str, Any] = {
         "log": str(imported.path),
         "run": imported.record.run,
         "poses": imported.poses,
         "align": imported.record.parameters["align"],
+    }
+    summary |= {
+        name: text for name, text in imported.record.parameters.items() if name in ("axes", "remarks")
     }
     compared = {} if imported.tracks_run is None else {"tracks_run": imported.tracks_run}
     return summary | compared | numbers

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ipsys_log.errors import IpsysError
+from ipsys_log.exchange.row_files import with_decimal_point
 from ipsys_log.messages import Distance, ReferencePoint, Rig
 from ipsys_log.plain_text import join_names
 from ipsys_log.units import CM_PER_M
@@ -228,7 +229,7 @@ def _height(text: str, faults: list[Fault], doubts: list[str]) -> float | None:
             Fault("height", f"height: {text} cm is too high; if it is in mm, type {value_cm / 10:g}")
         )
         return None
-    if 0 < value_cm < _LOWEST_CM and len(text.replace(",", ".").partition(".")[2]) > 1:
+    if 0 < value_cm < _LOWEST_CM and len(with_decimal_point(text).partition(".")[2]) > 1:
         faults.append(Fault("height", f"height: {text} cm looks like metres; type {_times(value_cm)}"))
         return None
     if 0 < value_cm < _LOWEST_CM:
@@ -251,4 +252,4 @@ def _number(text: str, item_name: str, name: str, faults: list[Fault]) -> float 
     if not _NUMBER.fullmatch(text):
         faults.append(Fault(name, f"{item_name}: {text!r} is not a number; type centimetres, such as 123.4"))
         return None
-    return float(text.replace(",", "."))
+    return float(with_decimal_point(text))

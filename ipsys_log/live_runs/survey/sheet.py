@@ -10,6 +10,7 @@ from pathlib import Path
 
 from ipsys_log.engine.request import Request
 from ipsys_log.errors import IpsysError
+from ipsys_log.exchange.row_files import find_delimiter, with_decimal_point
 from ipsys_log.live_runs.survey.blunders import MODEL_NAME
 from ipsys_log.live_runs.survey.checks import EntryCheck, check_entry
 from ipsys_log.live_runs.survey.entry import Entry, Fault, TypedEntry, parse_entry
@@ -65,7 +66,7 @@ def read_sheet(path: Path, rig: Rig, start_ns: int) -> list[SheetRow]:
         names each bad row by its line.
     """
     lines = _read_lines(path)
-    delimiter = ";" if lines and ";" in lines[0] else ","
+    delimiter = find_delimiter(lines[0] if lines else "")
     reader = csv.reader(lines, delimiter=delimiter)
     rows, faults = [], []
     try:
@@ -248,7 +249,7 @@ def _row(line: int, cell: dict[str, str], start_ns: int) -> SheetRow:
 def _time_ns(text: str, start_ns: int) -> int:
     """Parse seconds from the start of the log, or a date and time (UTC if it has no time zone)."""
     try:
-        seconds = float(text.replace(",", "."))
+        seconds = float(with_decimal_point(text))
         if math.isfinite(seconds) and abs(seconds) < 1e9:
             return start_ns + round(seconds * NS_PER_S)
     except ValueError:

@@ -287,7 +287,7 @@ def _converged(
         cut = _limits(linear) if cut is None or round_ < _FREE_ROUNDS else cut
         kept = np.linalg.norm(linear.position, axis=1) <= cut[0]
         channels = _channels(linear, kept, freedom, cut[1])
-        if len(channels) < 1 + freedom.headings:
+        if kept.sum() < LEAST_INSTANTS or len(channels) < 1 + freedom.headings:
             return None  # far away from any fit
         prior, values = _prior(names, state, freedom)
         if noise is None:

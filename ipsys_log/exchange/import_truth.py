@@ -146,6 +146,8 @@ def _check_options(into: Path | None, output: Path | None, options: TruthOptions
     if into is None and output is None:
         raise IpsysError("no log is named; give --into LOG, or -o LOG for a new one")
     check_choices(options.align, options.units or GivenUnits())
+    if options.pivot_m is not None and options.align == "none" and options.time_offset_ns is not None:
+        raise IpsysError("--pivot: has no effect with --align none and --time-offset; leave it out")
 
 
 def check_choices(align: str, units: GivenUnits) -> None:
@@ -244,9 +246,7 @@ def _given_residuals(poses: Sequence[Trajectory], tracks: dict[str, TrackedPath]
     for path in (path for path in poses if path.name in tracks):
         track = tracks[path.name].positions
         rows, zero_ns = last_poses(track), min(int(path.times_ns[0]), int(track.times_ns[0]))
-        true_s, track_s = (
-            (times_ns - zero_ns) / NS_PER_S for times_ns in (path.times_ns, track.times_ns[rows])
-        )
+        true_s, track_s = (path.times_ns - zero_ns) / NS_PER_S, (track.times_ns[rows] - zero_ns) / NS_PER_S
         pairs.append(PathPair(true_s, path.points_m, track_s, track.points_m[rows]))
     common = common_instants(pairs, 0.0) if pairs else None
     if common is None or not len(common.track_m):
@@ -268,10 +268,10 @@ def _marker_poses(alignment: PathAlignment, number: int, track: TrackedPath) -> 
         marker = Rotation.from_quat(poses.quaternions[is_turned]) * Rotation.from_euler("z", -body.turn_rad)
         quaternions[is_turned], axes[is_turned] = marker.as_quat(), marker.as_matrix()
     brackets = bracket_times(track.positions.times_ns, poses.times_ns, LONGEST_GAP_NS)
-    by_track = np.asarray(np.unwrap(np.nan_to_num(track.headings_rad)))
     rest = ~is_turned & brackets.is_known
     if rest.any():
-        axes[rest] = Rotation.from_euler("z", brackets.mix(by_track)[rest, None]).as_matrix()
+        by_track = brackets.mix(np.asarray(np.unwrap(np.nan_to_num(track.headings_rad))))
+        axes[rest] = Rotation.from_euler("z", by_track[rest, None]).as_matrix()
     points_m = poses.points_m - (axes @ body.pivot_m if body.pivot_m.any() else 0.0)
     known = np.asarray(np.isfinite(points_m).all(axis=1))
     return select_rows(replace(poses, points_m=points_m, quaternions=quaternions), known)

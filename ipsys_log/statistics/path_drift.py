@@ -19,6 +19,7 @@ from ipsys_log.statistics.path_fit import (
     PRIOR_LOG_SCALE,
     PRIOR_PIVOT_M,
 )
+from ipsys_log.statistics.path_noise import factorize
 from ipsys_log.statistics.path_pairs import Body, smooth_values
 
 # A segment takes at least this long; a longer path has longer ones.
@@ -47,8 +48,7 @@ class DriftFit:
 
     ``offset_s``, ``pivot_m`` (2,), ``body_turn_rad`` and ``log_scale`` are as in
     :class:`~ipsys_log.statistics.path_fit.State`. ``likelihood`` compares with that of
-    :class:`~ipsys_log.statistics.path_fit.PathFit`. ``walk`` are the standard deviations of the drift over a
-    motion of 1 m, of rotation in rad and of position in m.
+    :class:`~ipsys_log.statistics.path_fit.PathFit`.
     """
 
     offset_s: float
@@ -59,7 +59,6 @@ class DriftFit:
     likelihood: float
     turn_sigma_rad: float
     shift_sigma_m: float
-    walk: tuple[float, float]
     instants: int
 
 
@@ -141,7 +140,6 @@ def fit_drifting(
         likelihood,
         float(sigmas[middle]),
         float(sigmas[middle + 1 : middle + 3].max()),
-        (float(np.sqrt(chain.walk[0])), float(np.sqrt(chain.walk[1]))),
         len(rows.marker),
     )
 
@@ -243,7 +241,7 @@ def _improve(
     normal = (jacobian.T @ weighed).toarray() + np.diag(prior)
     right = weighed.T @ residual - prior * values
     scale = 1 / np.sqrt(np.diag(normal))
-    factor = np.linalg.cholesky(normal * np.outer(scale, scale))
+    factor = factorize(normal * np.outer(scale, scale))
     inverse = np.linalg.inv(factor) * scale
     covariance = inverse.T @ inverse
     step = covariance @ right

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ipsys_log.messages import Array, Mask
+from ipsys_log.statistics.ground_truth import wrap_angles
 from ipsys_log.statistics.path_noise import (
     Channel,
     Modes,
@@ -51,11 +52,10 @@ class Freedom:
     compared: tuple[int, ...]
     offset: bool = True
     drift: bool = False
-    scale: bool = True
+    scale: bool = False
     pivots: tuple[int, ...] = ()
     headings: bool = False
     uses_other_axes: bool = False
-    scale_prior: float = PRIOR_LOG_SCALE
 
     def names(self, bodies: int) -> list[tuple[str, int]]:
         """Return the unknowns in their order: a name, with the number of a body behind, and an axis."""
@@ -88,13 +88,12 @@ class Linear(NamedTuple):
 
     Attributes
     ----------
-    places_m : (n, 2), where the track is. ``times_s`` and ``body`` (n,) belong to them.
+    places_m : (n, 2), where the track is, at ``times_s`` (n,).
     position, heading : (n, d) and (n, 1), the residuals; NaN for a missing heading.
     """
 
     places_m: Array
     times_s: Array
-    body: Array
     position: Array
     position_jacobian: Array
     heading: Array
@@ -154,10 +153,9 @@ def _linearize_body(body: Body, number: int, count: int, state: State, freedom: 
     return Linear(
         (track_m - residual)[:, :2],  # the noise of the track would look like a steep field
         times_s,
-        np.full(len(times_s), number),
         residual[:, compared],
         np.concatenate(columns, axis=2)[:, compared],
-        ((heading + np.pi) % (2 * np.pi) - np.pi)[:, None],
+        wrap_angles(heading)[:, None],
         np.concatenate(turning, axis=2),
     )
 
@@ -266,7 +264,7 @@ def _rough(fit: PathFit) -> Noise:
 
 
 def _estimated(fit: PathFit) -> Noise:
-    prior, values = _prior(fit.names, fit.state, fit.freedom)
+    prior, values = _prior(fit.names, fit.state)
     return estimate_noise(fit.linear.places_m[fit.kept], fit.channels, prior, values)
 
 
@@ -289,7 +287,7 @@ def _converged(
         channels = _channels(linear, kept, freedom, cut[1])
         if kept.sum() < LEAST_INSTANTS or len(channels) < 1 + freedom.headings:
             return None  # far away from any fit
-        prior, values = _prior(names, state, freedom)
+        prior, values = _prior(names, state)
         if noise is None:
             solution = solve_white(channels, prior, values)
         else:
@@ -332,14 +330,12 @@ def _channels(linear: Linear, kept: Mask, freedom: Freedom, limit_rad: float) ->
     return found
 
 
-def _prior(names: Sequence[tuple[str, int]], state: State, freedom: Freedom) -> tuple[Array, Array]:
+def _prior(names: Sequence[tuple[str, int]], state: State) -> tuple[Array, Array]:
     """Return the information of the unknowns (p,) that is known beforehand, and their values (p,)."""
     information, values = np.zeros(len(names)), np.zeros(len(names))
     for place, (name, axis) in enumerate(names):
         if name == "drift":
             information[place], values[place] = PRIOR_DRIFT**-2, state.drift
-        elif name == "scale":
-            information[place], values[place] = freedom.scale_prior**-2, state.log_scale
         elif name.startswith("pivot"):
             number = int(name.split()[1])
             information[place], values[place] = PRIOR_PIVOT_M**-2, state.pivots_m[number, axis]

@@ -6,6 +6,7 @@ import numpy as np
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Array
+from ipsys_log.statistics.ground_truth import wrap_angles
 from ipsys_log.statistics.path_pairs import Body, search_turns_s, smooth_values
 from ipsys_log.vision.poses import rotate
 from ipsys_log.vision.time_brackets import bracket_times
@@ -22,6 +23,7 @@ def _yaws(axes: Array) -> Array:
 
 
 def turn_pairs(bodies: Sequence[Body]) -> list[tuple[Array, Array, Array, Array]]:
+    """Return times and continuous headings of the other body, and those of the track, by robot."""
     pairs = []
     for body in bodies:
         seen = np.isfinite(body.heading_rad)
@@ -112,4 +114,4 @@ def body_turn(body: Body, offset_s: float, rotation: Array) -> float:
     if not len(turns):
         return 0.0
     middle = float(np.angle(np.exp(1j * turns).mean()))
-    return middle + float(np.median((turns - middle + np.pi) % (2 * np.pi) - np.pi))
+    return middle + float(np.median(wrap_angles(turns - middle)))

@@ -9,7 +9,8 @@ from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import LinAlgError, cho_factor, cho_solve, solve_triangular
+from numpy.linalg import LinAlgError
+from scipy.linalg import cho_solve, solve_triangular
 from scipy.optimize import minimize
 
 from ipsys_log.messages import Array, Mask
@@ -153,6 +154,22 @@ class Solution(NamedTuple):
     likelihood: float
 
 
+def factorize(scaled: Array) -> Array:
+    """Return the lower Cholesky factor (p, p) of normal equations with a unit diagonal.
+
+    A small ridge gives unknowns that the motion does not determine a large standard deviation.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        The matrix is not finite, or far from positive.
+    """
+    for ridge in _RIDGES[:-1]:
+        with suppress(LinAlgError):
+            return np.asarray(np.linalg.cholesky(scaled + ridge * np.eye(len(scaled))))
+    return np.asarray(np.linalg.cholesky(scaled + _RIDGES[-1] * np.eye(len(scaled))))
+
+
 def _solve(parts: Sequence[tuple[Array, float]], prior: Array, values: Array) -> Solution:
     """Solve the weighed normal equations with a prior: the information (p,) of unknowns with ``values`` (p,).
 
@@ -164,15 +181,11 @@ def _solve(parts: Sequence[tuple[Array, float]], prior: Array, values: Array) ->
     normal = products[:-1, :-1] + np.diag(prior)
     right = products[:-1, -1] - prior * values
     scale = 1 / np.sqrt(np.diag(normal).clip(min=1e-30))
-    scaled = normal * np.outer(scale, scale)
-    for ridge in _RIDGES:
-        with suppress(LinAlgError):  # what the motion does not determine gets a large standard deviation
-            factor = cho_factor(scaled + ridge * np.eye(len(scale)))
-            break
-    step = scale * cho_solve(factor, scale * right)
-    covariance = np.outer(scale, scale) * cho_solve(factor, np.eye(len(scale)))
+    factor = factorize(normal * np.outer(scale, scale))
+    step = scale * cho_solve((factor, True), scale * right)
+    covariance = np.outer(scale, scale) * cho_solve((factor, True), np.eye(len(scale)))
     misfit = products[-1, -1] + float(prior @ values**2) - float(step @ right)
-    log_dets = sum(part[1] for part in parts) + 2 * np.log(np.diag(factor[0])).sum() - 2 * np.log(scale).sum()
+    log_dets = sum(part[1] for part in parts) + 2 * np.log(np.diag(factor)).sum() - 2 * np.log(scale).sum()
     return Solution(step, covariance, -0.5 * (misfit + log_dets))
 
 

@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ipsys_log.messages import Array, Mask
 from ipsys_log.vision.time_brackets import bracket_times
@@ -17,8 +16,6 @@ _USUAL_INTERVALS = 2.5
 # A gap is never shorter than the first, at high rates, and never longer than the second, at low ones.
 _SHORTEST_GAP_S = 0.1
 _LONGEST_GAP_S = 1.0
-# Neighbouring errors of tracks are alike. Errors further apart than this count as independent.
-_BLOCK_S = 2.0
 # A jump is this many times longer than the usual distance of a position from its neighbours,
 _JUMP = 10.0
 # longer than this,
@@ -50,15 +47,11 @@ def gap_limit_s(times_s: Array) -> float:
 
 
 class CommonInstants(NamedTuple):
-    """Positions of tracks and truth at common instants, (n, 3), and the velocity of the truth.
-
-    ``block`` (n,) numbers the intervals of 2 s of each path.
-    """
+    """Positions of tracks and truth at common instants, (n, 3), and the velocity of the truth."""
 
     track_m: Array
     true_m: Array
     velocity_m_s: Array
-    block: NDArray[np.int64]
 
 
 def jumps(times_s: Array, points_m: Array) -> Mask:
@@ -107,13 +100,11 @@ def common_instants(pairs: Sequence[PathPair], offset_s: float) -> CommonInstant
 
     ``offset_s`` is added to the times of the truth.
     """
-    parts: list[tuple[Array, Array, Array, Array]] = []
-    for number, pair in enumerate(pairs):
+    parts: list[tuple[Array, Array, Array]] = []
+    for pair in pairs:
         true_m, velocity_m_s, known = Spline.through(pair.true_s, pair.true_m).at(pair.track_s - offset_s)
-        blocks = np.floor(pair.track_s[known] / _BLOCK_S) * len(pairs) + number
-        parts.append((pair.track_m[known], true_m[known], velocity_m_s[known], blocks))
-    track_m, true_m, velocity_m_s, block = (np.concatenate(part) for part in zip(*parts, strict=True))
-    return CommonInstants(track_m, true_m, velocity_m_s, block.astype(np.int64))
+        parts.append((pair.track_m[known], true_m[known], velocity_m_s[known]))
+    return CommonInstants(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
 
 class Spline(NamedTuple):
@@ -184,10 +175,15 @@ class Body(NamedTuple):
     axes: Array
     spline: Spline
 
+    @classmethod
+    def of(cls, track: tuple[Array, Array, Array], other_s: Array, other_m: Array, axes: Array) -> Self:
+        """Return a body from the three arrays of its track, and those of the other system."""
+        spline = Spline.through(other_s, np.concatenate([other_m, axes.reshape(-1, 9)], axis=1))
+        return cls(*track, other_s, other_m, axes, spline)
+
     def with_axes(self, axes: Array) -> Self:
         """Return the body with other rotations (k, 3, 3)."""
-        spline = Spline.through(self.other_s, np.concatenate([self.other_m, axes.reshape(-1, 9)], axis=1))
-        return self._replace(axes=axes, spline=spline)
+        return self.of((self.track_s, self.track_m, self.heading_rad), self.other_s, self.other_m, axes)
 
 
 def thin(bodies: Sequence[Body], most: int) -> list[Body]:

@@ -13,7 +13,6 @@ from ipsys_log.statistics.path_cleaning import clean_trajectory, even_stamps, ve
 from ipsys_log.statistics.path_drift import ROUNDS, DriftFit, fit_drifting
 from ipsys_log.statistics.path_fit import (
     LEAST_INSTANTS,
-    PRIOR_LOG_SCALE,
     SCAN_S,
     Freedom,
     PathFit,
@@ -31,7 +30,6 @@ from ipsys_log.statistics.path_headings import (
 from ipsys_log.statistics.path_pairs import (
     Body,
     PathPair,
-    Spline,
     search_offsets_s,
     search_turns_s,
     smooth_values,
@@ -143,15 +141,10 @@ class Problem:
         is_turned = np.isfinite(other.quaternions).all(axis=1)
         if is_turned.any():
             axes[is_turned] = self.upright @ Rotation.from_quat(other.quaternions[is_turned]).as_matrix()
-        return Body(
-            (track.positions.times_ns[rows] - self.track_ns) / NS_PER_S,
-            track.positions.points_m[rows],
-            track.headings_rad[rows],
-            (other.times_ns - self.other_ns) / NS_PER_S,
-            other.points_m @ self.upright.T,
-            axes,
-            Spline.through(*(np.zeros((0,)), np.zeros((0, 12)))),
-        ).with_axes(axes)
+        track_s = (track.positions.times_ns[rows] - self.track_ns) / NS_PER_S
+        other_s = (other.times_ns - self.other_ns) / NS_PER_S
+        seen = track_s, track.positions.points_m[rows], track.headings_rad[rows]
+        return Body.of(seen, other_s, other.points_m @ self.upright.T, axes)
 
     @property
     def zero_ns(self) -> int:
@@ -200,7 +193,6 @@ class Problem:
             offset=is_free,
             drift=is_free and length_s > _DRIFT_FROM_S,
             scale=self.known.with_scale,
-            scale_prior=np.inf if self.known.with_scale else PRIOR_LOG_SCALE,
             pivots=pivots,
             headings=has_axes and has_headings,
             uses_other_axes=has_axes,
@@ -341,7 +333,7 @@ class Problem:
         if fits and abs(np.log(scale)) > _LARGEST_SCALE_SHARE:
             start = self.start(offset_s)
             assert start is not None
-            free = replace(self.freedom(), offset=False, drift=False, scale=True, scale_prior=np.inf)
+            free = replace(self.freedom(), offset=False, drift=False, scale=True)
             fit = fit_white(self.bodies, replace(start, log_scale=float(np.log(scale))), free)
             scale = scale if fit is None else float(np.exp(fit.state.log_scale))
             raise self._other_scale(scale)

@@ -197,6 +197,12 @@ _MOVING = [f"{n / 10},ada,{n / 50},{(n / 40) ** 2},0.1" for n in range(100)]
         ("a.csv", csv_text(*_MOVING), {}, "no time offset and alignment bring both"),
         ("a.csv", csv_text(*_MOVING), {"run": "best"}, "run best has no tracks .they are in: poly"),
         ("a.csv", csv_text(*_MOVING), {"align": "4d"}, "--align 4d: is not known"),
+        (
+            "a.csv",
+            csv_text(*_MOVING),
+            {"align": "none", "time_offset_ns": 0, "pivot_m": (0.1, 0.0, 0.0)},
+            "--pivot: has no effect",
+        ),
     ],
 )
 def test_wrong_truth_is_refused_and_changes_nothing(

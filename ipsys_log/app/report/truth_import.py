@@ -13,7 +13,7 @@ from ipsys_log.exchange.import_truth import TEXTS, ImportedTruth
 from ipsys_log.statistics.path_alignment import BodyFrame
 from ipsys_log.units import NS_PER_S
 
-_MS_PER_S = 1000.0
+_MS_PER_S, _US_PER_S = 1e3, 1e6
 
 
 def truth_lines(imported: ImportedTruth) -> Iterator[str]:
@@ -31,6 +31,11 @@ def truth_lines(imported: ImportedTruth) -> Iterator[str]:
     else:
         yield wrap_text(f"Alignment {align}: {_motion_text(imported)}.")
     if found is not None:
+        if found.axes:
+            yield f"Axes of the file: {found.axes}."
+        if math.isfinite(found.drift_sigma):
+            drift = f"{_US_PER_S * found.drift:.2f} us/s (sigma {_US_PER_S * found.drift_sigma:.2f})"
+            yield f"Drift of its clock: {drift}."
         for robot, body in zip(found.names, found.bodies, strict=True):
             yield wrap_text(_body_text(robot, body))
     if (residuals := imported.residuals) is not None:

@@ -20,6 +20,7 @@ Vec3 = Annotated[NDArray[np.float64], (3,)]
 Mat33 = Annotated[NDArray[np.float64], (3, 3)]
 Mat34 = Annotated[NDArray[np.float64], (3, 4)]
 Corners = Annotated[NDArray[np.float64], (4, 2)]
+Mat66 = Annotated[NDArray[np.float64], (6, 6)]
 Mat88 = Annotated[NDArray[np.float64], (8, 8)]
 
 

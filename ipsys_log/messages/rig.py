@@ -7,11 +7,29 @@ from ipsys_log.messages.message import Floats, Mat33, Mat34, TimeNs
 
 @dataclass(frozen=True, slots=True)
 class RigMarker:
+    """A marker. ``xyz_m`` and ``rpy_rad`` are its pose on its body, see ``schemas/ipsys/v1/rig.proto``."""
+
     id: int
     length_m: float | None = None
     robot: str | None = None
     height_m: float | None = None
     height_sigma_m: float | None = None
+    xyz_m: tuple[float, ...] = ()
+    rpy_rad: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class RigBody:
+    """A robot as a rigid body: with several markers, with a pivot, or with a tilt.
+
+    A body that is ``level`` stays so, at the heights of its markers. ``pivot_m`` and ``pivot_rpy_rad`` are
+    the origin and the axes of ``base_link`` in the coordinates of the body.
+    """
+
+    robot: str
+    level: bool
+    pivot_m: tuple[float, ...] = ()
+    pivot_rpy_rad: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,6 +135,7 @@ class Rig:
     nodes: RigNodes | None = None
     tape_scale_sigma: float | None = None
     ab_sigma_m: float | None = None
+    bodies: tuple[RigBody, ...] = ()
 
     @property
     def all_markers(self) -> tuple[RigMarker | ReferenceMarker, ...]:
@@ -142,10 +161,13 @@ class Rig:
     def height_of(self, marker_id: int) -> float | None:
         """Return the height above the floor at which a robot carries a marker, in m; None if unknown.
 
-        No robot carries a reference marker: its height is 0.
+        No robot carries a reference marker: its height is 0. A body that is not level has no height.
         """
         if self.is_reference(marker_id):
             return 0.0
+        body = self.body_of(marker_id)
+        if body is not None and not body.level:
+            return None
         for marker in self.markers:
             if marker.id == marker_id and marker.height_m is not None:
                 return marker.height_m
@@ -164,6 +186,13 @@ class Rig:
             if marker.id == marker_id and marker.robot is not None:
                 return marker.robot
         return f"marker_{marker_id}"
+
+    def body_of(self, marker_id: int) -> RigBody | None:
+        """Return the body that a marker is on; None for a robot that is no body of the rig."""
+        if not self.bodies:
+            return None
+        robot = self.robot_of(marker_id)
+        return next((body for body in self.bodies if body.robot == robot), None)
 
     def robot_heights_m(self) -> dict[str, float | None]:
         """Return the robots that the rig names, with the heights of their markers in m (None: unknown)."""

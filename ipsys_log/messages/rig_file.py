@@ -17,6 +17,7 @@ from ipsys_log.messages import (
     ReferenceMarker,
     ReferencePoint,
     Rig,
+    RigBody,
     RigCamera,
     RigMarker,
     RigNodes,
@@ -29,6 +30,7 @@ Item = TypeVar("Item")
 
 # Markers are below the cameras. A greater height is in cm.
 _HIGHEST_M = 5.0
+_LARGEST_BODY_M = 5.0  # from the centre of a marker to another one, or to the pivot
 _FARTHEST = 1e6  # m, px, s or Hz: no number of a lab is larger
 _LARGEST_INT = {"_ns": 2**62}  # by the last three characters of a name
 _LARGEST_ID = 2**31 - 1
@@ -44,6 +46,7 @@ STAMPS = ("start", "end")
 _NAME = re.compile(r"[a-z][a-z0-9_]*")
 _ITEMS = {
     "markers": RigMarker,
+    "bodies": RigBody,
     "cameras": RigCamera,
     "reference_points": ReferencePoint,
     "reference_markers": ReferenceMarker,
@@ -144,12 +147,19 @@ def toml_rows(item: Any) -> list[str]:
     return [
         f"{name} = {json.dumps(value, ensure_ascii=False)}"
         for name, value in values
-        if isinstance(value, (str, int, float)) or (value and _are_texts(value))
+        if isinstance(value, (bool, str, int, float))
+        or (value and (_are_texts(value) or _are_numbers(value)))
     ]
 
 
 def _are_texts(value: object) -> bool:
     return isinstance(value, (tuple, list)) and all(isinstance(text, str) for text in value)
+
+
+def _are_numbers(value: object) -> bool:
+    return isinstance(value, (tuple, list)) and all(
+        isinstance(number, (int, float)) and not isinstance(number, bool) for number in value
+    )
 
 
 def load_rig(path: Path) -> Rig:
@@ -230,9 +240,7 @@ def check_rig(rig: Rig, where: str) -> Rig:
     _check_unique((camera.name for camera in rig.cameras), f"{where}: two cameras have the name")
     ids = (marker.id for marker in rig.all_markers)
     _check_unique(ids, f"{where}: two markers have the id")
-    _check_unique(
-        (marker.robot for marker in rig.markers if marker.robot), f"{where}: two markers have the robot"
-    )
+    _check_bodies(rig, where)
     _check_unique((p.name for p in rig.reference_points), f"{where}: two reference points have the name")
     markers = rig.all_markers
     lengths = [rig.marker_length_m, *(m.length_m for m in markers if m.length_m is not None)]
@@ -249,6 +257,51 @@ def check_rig(rig: Rig, where: str) -> Rig:
     for item in (rig, rig.floor, *markers, *rig.cameras, *rig.reference_points):
         _check_numbers(item, where)
     return rig
+
+
+def _check_bodies(rig: Rig, where: str) -> None:
+    """Check that each robot with several markers is a body, and that bodies have markers with poses."""
+    _check_unique((body.robot for body in rig.bodies), f"{where}: two bodies have the robot")
+    markers: dict[str, list[RigMarker]] = {}
+    for marker in rig.markers:
+        if marker.robot is not None:
+            markers.setdefault(marker.robot, []).append(marker)
+    bodies = {body.robot for body in rig.bodies}
+    for robot, own in markers.items():
+        if len(own) > 1 and robot not in bodies:
+            raise IpsysError(
+                f"{where}: robot {robot!r} has several markers; add [[bodies]] with this robot, and with "
+                "level = true if it stays level"
+            )
+        _check_unique(
+            (marker.xyz_m for marker in own if marker.xyz_m), f"{where}: two markers of {robot} are at"
+        )
+    for body in rig.bodies:
+        if body.robot not in markers:
+            raise IpsysError(
+                f"{where}: no marker has the robot {body.robot!r} of [[bodies]]; name it in [[markers]]"
+            )
+        unknown = [m.id for m in markers[body.robot] if body.level and rig.height_of(m.id) is None]
+        if unknown:
+            raise IpsysError(
+                f"{where}: {body.robot} is level, but its marker {unknown[0]} has no height_m; write it, or "
+                "level = false"
+            )
+    for item, keys in (
+        *((m, ("xyz_m", "rpy_rad")) for m in rig.markers),
+        *((b, ("pivot_m", "pivot_rpy_rad")) for b in rig.bodies),
+    ):
+        for key in keys:
+            numbers = getattr(item, key)
+            if numbers and (len(numbers) != 3 or not all(map(math.isfinite, numbers))):
+                raise IpsysError(
+                    f"{where}: {key} of {item.robot} needs three numbers, such as [0.1, 0.0, 0.05]"
+                )
+            most, unit = (2 * math.pi, "rad") if key.endswith("rad") else (_LARGEST_BODY_M, "m")
+            if numbers and max(map(abs, numbers)) > most:
+                raise IpsysError(
+                    f"{where}: {key} of {item.robot} is {list(numbers)}; give {unit}, at most {most:.3g}"
+                )
 
 
 def _check_numbers(item: Any, where: str) -> None:
@@ -380,6 +433,12 @@ def _value(hint: Any, value: Any, where: str) -> Any:
             raise IpsysError(f"{where} is {_shown(value)}; give a whole number of at most {largest}")
     elif kind.startswith("str") and not isinstance(value, str):
         raise IpsysError(f"{where} must be text in quotes, found {_shown(value)}")
+    elif kind.startswith("bool") and not isinstance(value, bool):
+        raise IpsysError(f"{where} must be true or false, found {_shown(value)}")
+    elif kind.startswith("tuple[float"):
+        if not _are_numbers(value):
+            raise IpsysError(f"{where} must be a list of numbers, such as [0.1, 0.0], found {_shown(value)}")
+        return tuple(map(float, value))
     elif kind.startswith("tuple[str"):
         if not _are_texts(value):
             raise IpsysError(f'{where} must be a list of texts, such as ["a", "b"], found {_shown(value)}')

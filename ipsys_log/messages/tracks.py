@@ -5,7 +5,7 @@ The waypoints of robot runs are here, too, with the commands to the wheels that 
 
 from dataclasses import dataclass
 
-from ipsys_log.messages.message import Mat33, TimeNs, Vec3
+from ipsys_log.messages.message import Floats, Mat33, Mat66, TimeNs, Vec3
 
 # The states of a controller: it stands at a waypoint while it is holding, and after the last one when it is
 # finished. It is stopped while it gets no positions.
@@ -19,6 +19,10 @@ class Position:
     ``inside`` tells whether it lies in the volume of the calibration points; None if this is unknown.
     ``noise_m2`` is the part of ``covariance_m2`` that is new in each frame, without the errors of the
     calibration. ``heading_noise_rad`` is the same part of the heading, as a standard deviation.
+
+    The position of a body that is not level is that of its origin, with the id of its first marker. It has
+    the rotation vector ``rotation_rad`` from the axes of the body to those of the world, its ``pose_noise``,
+    and ``error_modes`` (7 * n,), see ``schemas/ipsys/v1/positions.proto``.
     """
 
     id: int
@@ -31,6 +35,9 @@ class Position:
     time_offset_ns: int | None = None
     noise_m2: Mat33 | None = None
     heading_noise_rad: float | None = None
+    rotation_rad: Vec3 | None = None
+    pose_noise: Mat66 | None = None
+    error_modes: Floats | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,6 +53,10 @@ class Track:
     ``cameras`` are those of the recent sightings. ``coasting_ns`` is the time since the last sighting, in a
     pose that is predicted because no camera sees the robot; otherwise None. ``age_ns`` is the time since the
     first sighting of the track: a robot that is carried away begins a new track.
+
+    A body that is not level has the rotation vector ``rotation_rad`` from its axes to those of the world, the
+    ``pose_covariance`` of its position and of a turn about the axes of the world, and the angular velocity
+    about these axes. Its heading is that of its x axis.
     """
 
     robot: str
@@ -64,6 +75,9 @@ class Track:
     turn_rate_sigma_rad_s: float | None = None
     coasting_ns: int | None = None
     age_ns: int | None = None
+    rotation_rad: Vec3 | None = None
+    pose_covariance: Mat66 | None = None
+    angular_velocity_rad_s: Vec3 | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -23,9 +23,11 @@ MODEL_CONTRADICTED = "model_contradicted"
 CONTRADICTED_HEIGHT, TILTED_MARKER = "contradicted_height", "tilted_marker"
 # The kinds of events for a camera whose images are mirrored, and for prints that are no markers of the rig.
 MIRRORED, OTHER_PRINTS = "mirrored_camera", "other_prints"
+# The kind of an event for a marker that is not where the rig places it on its body.
+LOOSE_MARKER = "loose_marker"
 # The kinds of events for inputs that the measurements of the log contradict.
 CONTRADICTIONS = frozenset(
-    (CALIBRATION_CONTRADICTED, CONTRADICTED_HEIGHT, TILTED_MARKER, MIRRORED, OTHER_PRINTS)
+    (CALIBRATION_CONTRADICTED, CONTRADICTED_HEIGHT, TILTED_MARKER, MIRRORED, OTHER_PRINTS, LOOSE_MARKER)
 )
 # The kinds of events for the first answers of the node of a camera, and for a long wait for them.
 NODE_ANSWERS, NODE_AWAITED = "node_answers", "node_awaited"

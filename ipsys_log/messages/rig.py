@@ -23,13 +23,15 @@ class RigBody:
     """A robot as a rigid body: with several markers, with a pivot, or with a tilt.
 
     A body that is ``level`` stays so, at the heights of its markers. ``pivot_m`` and ``pivot_rpy_rad`` are
-    the origin and the axes of ``base_link`` in the coordinates of the body.
+    the origin and the axes of ``base_link`` in the coordinates of the body. ``scale_sigma`` is the relative
+    standard deviation of its size.
     """
 
     robot: str
     level: bool
     pivot_m: tuple[float, ...] = ()
     pivot_rpy_rad: tuple[float, ...] = ()
+    scale_sigma: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -277,6 +277,10 @@ def _check_bodies(rig: Rig, where: str) -> None:
             (marker.xyz_m for marker in own if marker.xyz_m), f"{where}: two markers of {robot} are at"
         )
     for body in rig.bodies:
+        if body.scale_sigma is not None and not 0 < body.scale_sigma <= _LARGEST_SCALE_SIGMA:
+            raise IpsysError(
+                f"{where}: scale_sigma of {body.robot} is {body.scale_sigma:g}; write 0.001 for 0.1 %"
+            )
         if body.robot not in markers:
             raise IpsysError(
                 f"{where}: no marker has the robot {body.robot!r} of [[bodies]]; name it in [[markers]]"

@@ -6,18 +6,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ipsys_log.calibration.joint.locate import LevelPositions, locate_markers
+from ipsys_log.calibration.joint.locate import LevelPositions, corner_covariances, locate_markers
 from ipsys_log.calibration.joint.locate_poses import Poses, hold_heights, locate_poses
 from ipsys_log.calibration.joint.model import JointModel
 from ipsys_log.calibration.joint.payload import restore_joint
 from ipsys_log.calibration.joint.settings import JointSettings
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Array, Marker, Markers, Message, Model, Position, Positions, Rig
+from ipsys_log.models.body_positions import BodyLocator
 from ipsys_log.models.locate_points import ContradictedHeights, HeightSighting
 from ipsys_log.units import NS_PER_S
 
-# Corners without a covariance have about this error.
-_CORNER_SIGMA_PX = 0.25
 _HEIGHT_SIGMA_M = JointSettings().robot_height_sigma_m
 # A marker that is not where its corners say that it is has larger residuals. One in a million is larger by
 # chance: with five degrees of freedom at a known height, and with two for a full pose.
@@ -43,19 +42,13 @@ class _Located(NamedTuple):
     height: HeightSighting | None = None
 
 
-def corner_covariances(covariances_px2: Sequence[Array | None]) -> Array:
-    """Return the covariances (n, 8, 8) of corners, with the usual one for those that have none."""
-    unknown = _CORNER_SIGMA_PX**2 * np.eye(8)
-    return np.array([unknown if one is None else one for one in covariances_px2]).reshape(-1, 8, 8)
-
-
 class LocateCorners:
     """The step from markers to positions. A camera that is not in the model has no positions.
 
     A marker whose height is in the rig is level, at this height. If its corners contradict this, it gets its
     full pose: at this height if only its tilt is unusual, otherwise at the height by its corners, which an
-    event names. Markers without a height get their full pose. Reference markers are no robots: they have no
-    positions.
+    event names. Markers without a height get their full pose. Bodies that are not level have one position
+    for all their markers. Reference markers are no robots: they have no positions.
     """
 
     def __init__(self, model: Model) -> None:
@@ -63,23 +56,34 @@ class LocateCorners:
         self._cameras = restore_joint(model)
         self._rig: Rig | None = None
         self._heights = ContradictedHeights(model)
+        self._bodies = BodyLocator(self._cameras)
 
     def __call__(self, message: Message) -> Iterator[Any]:
         if isinstance(message.payload, Rig):
             self._rig = message.payload
+            self._bodies.use_rig(self._rig)
             return
         if not isinstance(message.payload, Markers):
             return
         camera = self._cameras.get(str(message.camera))
         if camera is not None:
-            rig = self._rig
+            rig, time_ns = self._rig, message.publish_time_ns
             markers = [m for m in message.payload.markers if rig is None or not rig.is_reference(m.id)]
+            on_bodies = [marker for marker in markers if marker.id in self._bodies.shapes]
+            markers = [marker for marker in markers if marker.id not in self._bodies.shapes]
             located = self._locate(camera, markers)
             heights = [row.height for row in located if row.height is not None]
-            yield from self._heights(message.publish_time_ns, message.camera, heights)
+            yield from self._heights(time_ns, message.camera, heights)
             rows = zip(markers, located, strict=True)
-            positions = tuple(_position(camera, *row) for row in rows if np.isfinite(row[1].point_m).all())
-            yield Positions(message.publish_time_ns, positions)
+            positions = [_position(camera, *row) for row in rows if np.isfinite(row[1].point_m).all()]
+            exposed_ns = [time_ns + (_time_offset_ns(camera, marker) or 0) for marker in on_bodies]
+            for result in self._bodies.locate(str(message.camera), time_ns, on_bodies, exposed_ns):
+                if isinstance(result, Position):
+                    positions.append(result)
+                else:
+                    yield result
+            positions.sort(key=lambda position: position.id)
+            yield Positions(time_ns, tuple(positions))
 
     def _locate(self, camera: JointModel, markers: Sequence[Marker]) -> list[_Located]:
         if markers and self._rig is None:

@@ -12,7 +12,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.calibration.joint.locate import edge_motion, linearise_corners
+from ipsys_log.calibration.joint.locate import edge_motion, linearise_corners, marker_arms
 from ipsys_log.calibration.joint.model import JointModel
 from ipsys_log.calibration.joint.settings import JointSettings
 from ipsys_log.errors import IpsysError
@@ -242,7 +242,8 @@ def _whitened_slopes(
     """Return slopes of whitened corners (n, 8, ...): by modes and height (m + 1), and by x, y and heading."""
     settings = JointSettings()
     sizes_m = np.full(len(corners_px), length_m * model.scale)
-    now = linearise_corners(model, corners_px, edge_motion(corners_px), centres_m, turns, sizes_m)
+    arms_m = marker_arms(turns, sizes_m)
+    now = linearise_corners(model, corners_px, edge_motion(corners_px), centres_m, arms_m)
     _, floor_slopes, floor_modes = model.floor.evaluate(centres_m, model.amplitudes)
     by_height = now.by_pose[:, :, 2:3]
     by_pose = now.by_pose[:, :, _FLAT]

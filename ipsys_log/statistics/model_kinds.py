@@ -324,7 +324,12 @@ class CornerModels:
     def place_part(self, rig: Rig) -> object:
         references = {m.id for m in rig.reference_markers}
         lengths = {(m.id, m.length_m) for m in rig.markers}
-        return _POINT_KIND.place_part(rig), rig.marker_length_m, lengths, references
+        own = _POINT_KIND.place_part(rig), rig.marker_length_m, lengths, references
+        return (
+            (*own, rig.bodies, [(m.id, m.robot, m.xyz_m, m.rpy_rad) for m in rig.markers])
+            if rig.bodies
+            else own
+        )
 
     def check_points(self, name: str, where: str, train_m: Array, has_corners: bool) -> None:
         if not has_corners:

@@ -14,6 +14,9 @@ from ipsys_log.messages import Array, Rig, Track
 from ipsys_log.vision.markers import marker_corners
 from ipsys_log.vision.poses import level_turns, make_pose, rotation, transform
 
+# Relative error of a printed side, and of a distance that is measured by hand.
+_SCALE_SIGMA = 0.001
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BodyShape:
@@ -24,6 +27,8 @@ class BodyShape:
     robot : its name.
     id : the id of its first marker, also if the pose of that one is unknown.
     is_level : it stays level.
+    is_measured : the poses of its markers are known. Otherwise it has one marker of the nominal size.
+    scale_sigma : relative standard deviation of its size.
     corners_m : by marker id, the corners (4, 3) in the coordinates of the body, in the order of OpenCV.
     body_from_pivot : (4, 4).
     """
@@ -31,6 +36,8 @@ class BodyShape:
     robot: str
     id: int
     is_level: bool
+    is_measured: bool
+    scale_sigma: float
     corners_m: dict[int, Array]
     body_from_pivot: Array
 
@@ -48,7 +55,9 @@ def body_shapes(rig: Rig) -> tuple[BodyShape, ...]:
             if not number or marker.xyz_m
         }
         pivot = pose_from_rpy(body.pivot_m, body.pivot_rpy_rad)
-        shapes.append(BodyShape(body.robot, markers[0].id, body.level, corners_m, pivot))
+        measured = any(marker.xyz_m for marker in markers)
+        sigma = _SCALE_SIGMA if body.scale_sigma is None else body.scale_sigma
+        shapes.append(BodyShape(body.robot, markers[0].id, body.level, measured, sigma, corners_m, pivot))
     return tuple(shapes)
 
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from ipsys_log.calibration.joint.fit import JointFit, fit_jointly
-from ipsys_log.calibration.joint.locate import edge_motion, linearise_corners
+from ipsys_log.calibration.joint.locate import edge_motion, linearise_corners, marker_arms
 from ipsys_log.calibration.joint.model import JointModel, build_models
 from ipsys_log.errors import IpsysError
 from ipsys_log.statistics.expected_error import (
@@ -124,7 +124,9 @@ def test_effect_of_a_drive_is_that_of_all_its_unknowns(
     for model in models.values():
         view = see_markers(model, (1920, 1080), place_m[None], HEIGHT_M, LENGTH_M)
         inward, sizes_m = edge_motion(view.corners_px), np.array([LENGTH_M * model.scale])
-        now = linearise_corners(model, view.corners_px, inward, view.centres_m, view.turns, sizes_m)
+        now = linearise_corners(
+            model, view.corners_px, inward, view.centres_m, marker_arms(view.turns, sizes_m)
+        )
         _, floor_slopes, floor_modes = model.floor.evaluate(view.centres_m, model.amplitudes)
         by_height = now.by_pose[0, :, 2]
         by_modes = now.by_camera[0] @ model.modes

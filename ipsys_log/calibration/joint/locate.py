@@ -5,6 +5,7 @@ The residuals and derivatives of the corners also serve other estimates.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -17,8 +18,16 @@ from ipsys_log.vision.lenses import undistort
 from ipsys_log.vision.markers import marker_corners
 from ipsys_log.vision.poses import cross, level_turns
 
+# Corners without a covariance have about this error.
+_CORNER_SIGMA_PX = 0.25
 _FLAT = np.array([0, 1, 5])
 _CORNERS = marker_corners(1.0)
+
+
+def corner_covariances(covariances_px2: Sequence[Array | None]) -> Array:
+    """Return the covariances (n, 8, 8) of corners, with the usual one for those that have none."""
+    unknown = _CORNER_SIGMA_PX**2 * np.eye(8)
+    return np.array([unknown if one is None else one for one in covariances_px2]).reshape(-1, 8, 8)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,9 +85,8 @@ def locate_markers(
     """
     inward = edge_motion(corners_px)
     points_m, headings_rad, floor_slopes, floor_modes = _start(model, corners_px, inward, heights_m)
-    now = linearise_corners(
-        model, corners_px, inward, points_m, level_turns(headings_rad), lengths_m * model.scale
-    )
+    arms_m = marker_arms(level_turns(headings_rad), lengths_m * model.scale)
+    now = linearise_corners(model, corners_px, inward, points_m, arms_m)
     by_height = now.by_pose[:, :, 2:3]
     slopes = now.by_pose[:, :, _FLAT]
     slopes[:, :, :2] += by_height * floor_slopes[:, None]
@@ -141,8 +149,17 @@ def edge_motion(corners_px: Array) -> Array:
     return np.asarray(units - units[:, [3, 0, 1, 2]])
 
 
+def marker_arms(turns: Array, sizes_m: Array) -> Array:
+    """Return the vectors (n, 4, 3) from the centres of markers to their corners, in the world.
+
+    ``turns`` (n, 3, 3) are their axes, ``sizes_m`` (n,) their sides.
+    """
+    arms_m: Array = _CORNERS @ turns.swapaxes(1, 2) * sizes_m[:, None, None]
+    return arms_m
+
+
 def linearise_corners(
-    model: JointModel, corners_px: Array, inward: Array, points_m: Array, turns: Array, sizes_m: Array
+    model: JointModel, corners_px: Array, inward: Array, points_m: Array, arms_m: Array
 ) -> CornerSlopes:
     """Return residuals and slopes of the corners of markers.
 
@@ -151,11 +168,10 @@ def linearise_corners(
     model : the calibrated camera.
     corners_px : (n, 4, 2), measured corners.
     inward : (n, 4, 2), from :func:`edge_motion`.
-    points_m, turns : (n, 3) and (n, 3, 3), centres and axes of the markers in the world.
-    sizes_m : (n,), sides of the markers.
+    points_m, arms_m : (n, 3) and (n, 4, 3): the centres of the markers, or the origins of their bodies, and
+        the vectors from there to the corners, in the world. A turn is one about these points.
     """
     count, lens = len(points_m), len(model.lens)
-    arms_m = _CORNERS @ turns.swapaxes(1, 2) * sizes_m[:, None, None]
     points_c = (arms_m + (points_m - model.origin_m)[:, None]) @ model.camera_from_world.T
     pixels, by_point, by_lens = project_with_slopes(model.lens_model, model.lens, points_c.reshape(-1, 3))
     by_point = by_point.reshape(count, 4, 2, 3)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ipsys_log.calibration.joint.locate import edge_motion, linearise_corners
+from ipsys_log.calibration.joint.locate import edge_motion, linearise_corners, marker_arms
 from ipsys_log.calibration.joint.model import JointModel
 from ipsys_log.messages import Array
 from ipsys_log.vision.lenses import undistort
@@ -62,7 +62,7 @@ def locate_poses(model: JointModel, corners_px: Array, covariances_px2: Array, l
     points_m, turns = _start(model, corners_px - model.edge_offset_px * inward, variances, sizes_m)
     weights = np.linalg.inv(variances)
     for _ in range(_STEPS):
-        now = linearise_corners(model, corners_px, inward, points_m, turns, sizes_m)
+        now = linearise_corners(model, corners_px, inward, points_m, marker_arms(turns, sizes_m))
         across = now.by_pose.swapaxes(1, 2) @ weights
         spread = np.linalg.inv(across @ now.by_pose)
         gains = spread @ across

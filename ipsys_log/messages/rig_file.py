@@ -291,21 +291,19 @@ def _check_bodies(rig: Rig, where: str) -> None:
                 f"{where}: {body.robot} is level, but its marker {unknown[0]} has no height_m; write it, or "
                 "level = false"
             )
-    for item, keys in (
-        *((m, ("xyz_m", "rpy_rad")) for m in rig.markers),
-        *((b, ("pivot_m", "pivot_rpy_rad")) for b in rig.bodies),
-    ):
-        for key in keys:
-            numbers = getattr(item, key)
-            if numbers and (len(numbers) != 3 or not all(map(math.isfinite, numbers))):
-                raise IpsysError(
-                    f"{where}: {key} of {item.robot} needs three numbers, such as [0.1, 0.0, 0.05]"
-                )
-            most, unit = (2 * math.pi, "rad") if key.endswith("rad") else (_LARGEST_BODY_M, "m")
-            if numbers and max(map(abs, numbers)) > most:
-                raise IpsysError(
-                    f"{where}: {key} of {item.robot} is {list(numbers)}; give {unit}, at most {most:.3g}"
-                )
+        _check_triples(body, ("pivot_m", "pivot_rpy_rad"), f"{where}: {{}} of {body.robot}")
+    for marker in rig.markers:
+        _check_triples(marker, ("xyz_m", "rpy_rad"), f"{where}: {{}} of marker {marker.id}")
+
+
+def _check_triples(item: RigMarker | RigBody, keys: Iterable[str], where: str) -> None:
+    for key in keys:
+        numbers, name = getattr(item, key), where.format(key)
+        if numbers and (len(numbers) != 3 or not all(map(math.isfinite, numbers))):
+            raise IpsysError(f"{name} needs three numbers, such as [0.1, 0.0, 0.05]")
+        most, unit = (2 * math.pi, "rad") if key.endswith("rad") else (_LARGEST_BODY_M, "m")
+        if numbers and max(map(abs, numbers)) > most:
+            raise IpsysError(f"{name} is {list(numbers)}; give {unit}, at most {most:.3g}")
 
 
 def _check_numbers(item: Any, where: str) -> None:

@@ -17,6 +17,7 @@ from ipsys_log.calibration.joint.locate_bodies import (
 from ipsys_log.calibration.joint.model import JointModel
 from ipsys_log.messages import Array, Event, Marker, Position, Rig
 from ipsys_log.messages.events import LOOSE_MARKER
+from ipsys_log.models.tracking.frame_reader import FREE_MODES
 from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.bodies import BodyShape, body_shapes
 from ipsys_log.vision.lenses import undistort
@@ -24,7 +25,7 @@ from ipsys_log.vision.poses import rotate, rotation_vector
 
 # The number of modes of the calibration that positions keep. The errors by the others, 0.07 mm after 75
 # calibration points, count as noise.
-MODES = 20
+MODES = FREE_MODES - 1
 # Bodies that are carried or fly: accelerations, and the largest usual speeds.
 _ACCELERATION = np.repeat([3.0, 10.0], 3)  # m/s^2, rad/s^2
 _SPEED = np.repeat([0.5, 1.5], 3)  # m/s, rad/s

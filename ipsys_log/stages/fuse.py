@@ -30,7 +30,9 @@ from ipsys_log.models.tracking.track_messages import (
     track_reads,
     tracked_part,
 )
-from ipsys_log.models.tracking.tracks import Pose, RobotTracks
+from ipsys_log.models.tracking.tracks import FREE_BODIES, Pose, RobotTracks
+from ipsys_log.vision.bodies import track_rotation
+from ipsys_log.vision.poses import quaternion
 
 
 class Fuse:
@@ -49,7 +51,7 @@ class Fuse:
     def __init__(self, run: str, model: Model | None = None) -> None:
         self._run, self._reader = run, FrameReader(model)
         self._rig: Rig | None = None
-        self._tracks = RobotTracks()
+        self._tracks, self._bodies = RobotTracks(), RobotTracks(FREE_BODIES)
         self._late_frames = LateFrames()
 
     def __call__(self, message: Message) -> Iterator[Any]:
@@ -72,10 +74,11 @@ class Fuse:
             self._tracks = RobotTracks(fade_m=self._reader.modes.fade_m)
 
     def _poses(self, message: Message) -> list[Pose]:
-        poses = self._tracks.coast_before(message.publish_time_ns)
-        frame = self._reader.read(str(message.camera), message.publish_time_ns, message.payload.positions)
-        if frame is not None:
-            poses += self._tracks.observe(
+        time_ns = message.publish_time_ns
+        poses = [*self._tracks.coast_before(time_ns), *self._bodies.coast_before(time_ns)]
+        for frame in self._reader.read(str(message.camera), time_ns, message.payload.positions):
+            tracks = self._tracks if frame.sightings.turns is None else self._bodies
+            poses += tracks.observe(
                 frame.camera,
                 frame.robots,
                 frame.times_ns,
@@ -96,15 +99,14 @@ class Fuse:
 
 
 def _transform(track: Track, run: str, time_ns: int) -> FrameTransform:
-    # A transform must have a rotation; /runs/<run>/tracks shows that the heading is missing.
-    half_rad = (track.heading_rad or 0.0) / 2
-    return FrameTransform(
-        time_ns,
-        "world",
-        f"{run}/{track.robot}",
-        Vector3(track.x_m, track.y_m, track.z_m),
-        Quaternion(0.0, 0.0, sin(half_rad), cos(half_rad)),
-    )
+    if track.rotation_rad is not None:
+        turned = Quaternion(*quaternion(track_rotation(track)))
+    else:
+        # A transform must have a rotation; /runs/<run>/tracks shows that the heading is missing.
+        half_rad = (track.heading_rad or 0.0) / 2
+        turned = Quaternion(0.0, 0.0, sin(half_rad), cos(half_rad))
+    place = Vector3(track.x_m, track.y_m, track.z_m)
+    return FrameTransform(time_ns, "world", f"{run}/{track.robot}", place, turned)
 
 
 def _plan(view: StageView, _options: Mapping[str, str]) -> Plan:

@@ -63,7 +63,7 @@ def body_shapes(rig: Rig) -> tuple[BodyShape, ...]:
 
 def marker_corners_m(length_m: float) -> Array:
     """Return the corners (4, 3) of a marker in its own axes, in the order of OpenCV."""
-    return marker_corners(length_m) @ level_turns(np.zeros(1))[0].T
+    return np.asarray(marker_corners(length_m) @ level_turns(np.zeros(1))[0].T)
 
 
 def pose_from_rpy(origin_m: tuple[float, ...], rpy_rad: tuple[float, ...]) -> Array:

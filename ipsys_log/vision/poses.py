@@ -111,6 +111,14 @@ def rotate(vectors_rad: Array) -> Array:
     return np.asarray(Rotation.from_rotvec(vectors_rad).as_matrix(), dtype=np.float64)
 
 
+def rotation_vectors(rotations: Array) -> Array:
+    """Return rotation vectors (n, 3) of rotation matrices (n, 3, 3): the inverse of :func:`rotate`."""
+    # Late: most commands rotate nothing, and scipy takes long to load.
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_matrix(rotations).as_rotvec(), dtype=np.float64)
+
+
 def quaternion(rotation: Array) -> tuple[float, float, float, float]:
     """Return the quaternion (x, y, z, w) of a rotation matrix (3, 3)."""
     # Late: most commands rotate nothing, and scipy takes long to load.

@@ -11,6 +11,7 @@ from scipy.optimize import least_squares
 
 from ipsys_log.calibration.joint.fit import JointFit, fit_jointly
 from ipsys_log.calibration.joint.locate import locate_markers
+from ipsys_log.calibration.joint.locate_bodies import BodySightings, locate_bodies
 from ipsys_log.calibration.joint.locate_poses import locate_poses
 from ipsys_log.calibration.joint.model import JointModel, build_models
 from ipsys_log.calibration.joint.parameters import State
@@ -26,12 +27,14 @@ from ipsys_log.messages import (
     Positions,
     ReferenceMarker,
     Rig,
+    RigBody,
     RigMarker,
 )
 from ipsys_log.models.locate_corners import LocateCorners
+from ipsys_log.vision.bodies import body_shapes
 from ipsys_log.vision.lenses import project
 from ipsys_log.vision.markers import marker_corners
-from ipsys_log.vision.poses import make_pose, pose_facing_up, rotation, transform
+from ipsys_log.vision.poses import make_pose, pose_facing_up, rotation, rotation_vector, transform
 from tests.joint.small_lab import LENGTH_M, Array, make_lab
 
 POSES = [(1.6, 1.2, 0.1, 0.3), (2.4, 2.2, 0.0, -2.0), (3.1, 1.9, 0.2, 1.5)]
@@ -281,3 +284,126 @@ def test_calibration_points_are_no_wrong_heights(fit: JointFit, model: JointMode
     still = [sighted[n] for n in (0, 10, 25) for _ in range(20)]
     events, _ = drive(joint_payload(fit, {"c0": pairs}, 0), still, 0.1)
     assert events == []
+
+
+# A drone: two markers on a plate, and one on a slanted side.
+DRONE = Rig(
+    "lab",
+    "DICT_4X4_100",
+    LENGTH_M,
+    (
+        RigMarker(0, 0.1, "drone"),
+        RigMarker(1, 0.1, "drone", xyz_m=(0.2, 0.05, 0.0), rpy_rad=(0.0, 0.0, 0.4)),
+        RigMarker(2, 0.1, "drone", xyz_m=(0.0, 0.2, -0.05), rpy_rad=(-0.5, 0.0, 0.0)),
+    ),
+    bodies=(RigBody("drone", level=False),),
+)
+DRONE_M = np.array(list(body_shapes(DRONE)[0].corners_m.values()))
+
+
+def see_corners(model: JointModel, corners_m: Array) -> Array:
+    """Return the exact pixels of corners (..., 4, 3) in the world."""
+    camera = model.camera_from_world
+    points_c = (corners_m.reshape(-1, 3) - model.origin_m) @ camera.T
+    pixels = project(points_c, model.calibration).reshape(-1, 4, 2)
+    after, before = (np.roll(pixels, shift, axis=1) - pixels for shift in (-1, 1))
+    units = [side / np.linalg.norm(side, axis=2, keepdims=True) for side in (after, before)]
+    return np.asarray(pixels + model.edge_offset_px * (units[0] + units[1]))
+
+
+def sight_body(corners_px: Array, sigma_px: float) -> BodySightings:
+    """Return the sighting of one body that stands still, whose rotation is unknown."""
+    count = len(corners_px)
+    covariances = np.tile(sigma_px**2 * np.eye(8), (1, count, 1, 1))
+    still = np.zeros((1, 6))
+    times = np.zeros((1, count))
+    return BodySightings(
+        corners_px[None],
+        covariances,
+        DRONE_M[None, :count],
+        times,
+        still,
+        still,
+        np.eye(3)[None],
+        np.full(1, np.inf),
+    )
+
+
+def test_pose_of_a_body_and_its_noise_agree_with_scipy(model: JointModel) -> None:
+    rng = np.random.default_rng(3)
+    pose = make_pose(rotation(np.array([0.3, -0.2, 1.0])), np.array([2.2, 1.9, 0.7]))
+    corners_px = see_corners(model, transform(pose, DRONE_M.reshape(-1, 3)).reshape(-1, 4, 3))
+    corners_px = corners_px + rng.normal(0, 0.05, corners_px.shape)
+    own = replace(model, corner_floor_px=0.0)
+    found = locate_bodies(own, sight_body(corners_px, 0.05))
+
+    def misses(values: Array) -> Array:
+        turned = make_pose(rotation(values[3:]) @ found.turns[0], values[:3])
+        again_px = see_corners(model, transform(turned, DRONE_M.reshape(-1, 3)).reshape(-1, 4, 3))
+        return np.asarray((again_px - corners_px).ravel() / 0.05)
+
+    solved = least_squares(misses, np.r_[found.points_m[0], np.full(3, 0.01)], xtol=1e-14, x_scale=1e-3)
+    assert np.abs(solved.x - np.r_[found.points_m[0], np.zeros(3)]).max() < 2e-6
+    sigmas = np.sqrt(np.linalg.inv(solved.jac.T @ solved.jac).diagonal())
+    assert np.abs(np.sqrt(found.noise[0].diagonal()) / sigmas - 1).max() < 0.02
+    assert abs(found.chi2[0] / (2 * solved.cost) - 1) < 0.01
+
+
+def fly(
+    model: JointModel, payload: Model, ids: tuple[int, ...], sigma_px: float, loose_m: float = 0.0
+) -> tuple[list[Event], list[Array]]:
+    """Fly a tumbling drone past a camera with a rolling shutter; return events, and errors (6,) of poses.
+
+    Marker 2 is ``loose_m`` away from its place.
+    """
+    rng, step, row_s, count = np.random.default_rng(4), LocateCorners(payload), 31e-6, 60
+    assert not list(step(Message("/rig", 0, 0, DRONE)))
+    events: list[Event] = []
+    errors: list[Array] = []
+    corners_m = DRONE_M + np.array([0.0, 0.0, loose_m]) * (np.arange(3) == 2)[:, None, None]
+
+    def pose_at(time_s: float) -> Array:
+        tilts = 0.5 * np.sin([3 * time_s, 2 * time_s + 1])
+        turn = rotation(np.array([0.0, 0.0, time_s])) @ rotation(np.array([*tilts, 0.0]))
+        return make_pose(turn, np.array([1.5 + 0.5 * time_s, 1.4 + 0.3 * time_s, 0.4 + 0.2 * np.sin(time_s)]))
+
+    for number in range(count):
+        stamp_ns, markers = number * 33_000_000, []
+        for n in ids:
+            offset_s = 0.0
+            for _ in range(3):
+                world_m = transform(pose_at(stamp_ns / 1e9 + offset_s), corners_m[n])
+                corners_px = see_corners(model, world_m)[0]
+                offset_s = corners_px[:, 1].mean() * row_s
+            moved_px = corners_px + rng.normal(0, sigma_px, (4, 2))
+            markers.append(Marker(n, moved_px, sigma_px**2 * np.eye(8), round(offset_s * 1e9)))
+        frame = Markers(stamp_ns, tuple(markers), 1920, 1080)
+        for payload_ in step(Message("/markers", stamp_ns, stamp_ns, frame, "c0")):
+            if isinstance(payload_, Event):
+                events.append(payload_)
+                continue
+            (position,) = payload_.positions
+            true = pose_at((stamp_ns + position.time_offset_ns) / 1e9)
+            point_m = np.array([position.x_m, position.y_m, position.z_m])
+            turned_rad = rotation_vector(rotation(position.rotation_rad) @ true[:3, :3].T)
+            errors.append(np.r_[point_m - true[:3, 3], turned_rad])
+    assert len(errors) == count
+    return events, errors
+
+
+def test_moving_body_under_a_rolling_shutter_has_one_exact_pose(fit: JointFit, model: JointModel) -> None:
+    """Between its markers lie 6 ms, in which it moves by 4 mm."""
+    _, errors = fly(model, joint_payload(fit, {}, 0), (0, 1, 2), 0.001)
+    assert np.abs(np.array(errors)[5:, :3]).max() < 2e-4
+    assert np.abs(np.array(errors)[5:, 3:]).max() < 1e-3
+
+
+def test_single_tilting_marker_never_has_its_mirrored_pose(fit: JointFit, model: JointModel) -> None:
+    _, errors = fly(model, joint_payload(fit, {}, 0), (0,), 0.05)
+    assert np.degrees(np.abs(np.array(errors)[:, 3:]).max()) < 4.0
+
+
+def test_loose_marker_is_named_once_and_left_out(fit: JointFit, model: JointModel) -> None:
+    (event,), errors = fly(model, joint_payload(fit, {}, 0), (0, 1, 2), 0.02, loose_m=0.01)
+    assert (event.kind, event.marker_id) == ("loose_marker", 2)
+    assert np.median(np.linalg.norm(np.array(errors)[:, :3], axis=1)) < 1e-3

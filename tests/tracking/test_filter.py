@@ -9,8 +9,7 @@ from scipy.integrate import quad_vec
 from scipy.linalg import expm
 
 from ipsys_log.models.tracking.filter import (
-    MOTION,
-    POSE,
+    LEVEL,
     UNKNOWN_RAD2,
     MotionNoise,
     Sightings,
@@ -30,12 +29,12 @@ LINEAR = MotionNoise(bend_rad_s=0.0, acceleration_m_s2=2.0)
 @pytest.mark.parametrize("duration_s", [1e-4, 0.011, 0.3, 1.0])
 def test_transition_solves_the_differential_equation(duration_s: float) -> None:
     noise = MotionNoise()
-    slope = np.zeros((MOTION, MOTION))
+    slope = np.zeros((LEVEL.size, LEVEL.size))
     slope[:4, 4:8] = np.eye(4)
     slope[4, 8] = slope[5, 9] = 1.0
     slope[8, 8] = slope[9, 9] = -1 / noise.hold_s
     variance = noise.acceleration_m_s2**2 + (noise.bend_rad_s * 0.7) ** 2
-    density = np.zeros(MOTION)
+    density = np.zeros(LEVEL.size)
     density[6:] = noise.climb_m_s2**2, noise.turn_rad_s2**2, *[2 * variance / noise.hold_s] * 2
 
     def growth(time_s: float) -> Array:
@@ -68,28 +67,32 @@ def test_filter_equals_the_conditional_mean_of_all_states() -> None:
         one = seen.take(np.array([row]))
         states = predict(states, durations_s[row - 1 : row], LINEAR)
         states = update(states, one, compare(states, one))
-        mean = np.concatenate([mean, forward[row - 1] @ mean[-MOTION:]])
-        across = covariance[:, -MOTION:] @ forward[row - 1].T
-        corner = forward[row - 1] @ covariance[-MOTION:, -MOTION:] @ forward[row - 1].T + spread[row - 1]
+        mean = np.concatenate([mean, forward[row - 1] @ mean[-LEVEL.size :]])
+        across = covariance[:, -LEVEL.size :] @ forward[row - 1].T
+        corner = (
+            forward[row - 1] @ covariance[-LEVEL.size :, -LEVEL.size :] @ forward[row - 1].T + spread[row - 1]
+        )
         covariance = np.block([[covariance, across], [across.T, corner]])
     look = np.zeros((4 * (count - 1), len(mean)))
     noise = np.zeros((len(look), len(look)))
     for row in range(1, count):
         rows = slice(4 * row - 4, 4 * row)
-        look[rows, MOTION * row : MOTION * row + 4] = np.eye(4)
+        look[rows, LEVEL.size * row : LEVEL.size * row + 4] = np.eye(4)
         noise[rows, rows] = seen.noise[row]
     gain = np.linalg.solve(look @ covariance @ look.T + noise, look @ covariance).T
     expected = mean + gain @ (seen.poses[1:].ravel() - look @ mean)
     remaining = covariance - gain @ look @ covariance
-    np.testing.assert_allclose(states.means[0], expected[-MOTION:], rtol=1e-6, atol=1e-9)
-    np.testing.assert_allclose(states.covariances[0], remaining[-MOTION:, -MOTION:], rtol=1e-5, atol=1e-12)
+    np.testing.assert_allclose(states.means[0], expected[-LEVEL.size :], rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(
+        states.covariances[0], remaining[-LEVEL.size :, -LEVEL.size :], rtol=1e-5, atol=1e-12
+    )
 
 
 def simulate(count: int, steps: int) -> tuple[States, Array, Array]:
     """Filter tracks with common errors of the calibration: final states, true states, and amplitudes."""
     rng, m = np.random.default_rng(2), 3
     amplitudes = rng.standard_normal((count, m))
-    true = np.zeros((count, MOTION))
+    true = np.zeros((count, LEVEL.size))
     true[:, 4:] = rng.normal(0.0, [1.0, 1.0, 0.05, 2.0, 1.5, 1.5], (count, 6))
     tables = 1e-3 * rng.standard_normal((2, 4, m))
     noise = np.broadcast_to(np.diag([1e-4, 1e-4, 1e-4, 1e-3]) ** 2, (count, 4, 4))
@@ -97,10 +100,13 @@ def simulate(count: int, steps: int) -> tuple[States, Array, Array]:
     for step in range(steps):
         if step:
             forward, spread = transition(np.array([0.02]), np.zeros(1), LINEAR)
-            kick = rng.standard_normal((count, MOTION)) @ np.linalg.cholesky(spread[0] + 1e-18 * np.eye(10)).T
+            kick = (
+                rng.standard_normal((count, LEVEL.size))
+                @ np.linalg.cholesky(spread[0] + 1e-18 * np.eye(10)).T
+            )
             true = true @ forward[0].T + kick
         modes = np.broadcast_to(tables[step // 3 % 2], (count, 4, m))
-        poses = true[:, POSE] + amplitudes @ tables[step // 3 % 2].T
+        poses = true[:, LEVEL.pose] + amplitudes @ tables[step // 3 % 2].T
         poses = poses + rng.normal(0.0, [1e-4, 1e-4, 1e-4, 1e-3], (count, 4))
         seen = Sightings(poses, noise, modes, np.zeros((count, m)))
         if states is None:
@@ -127,9 +133,9 @@ def test_covariance_is_that_of_the_errors_with_common_biases() -> None:
 
 
 def test_late_clock_makes_the_position_uncertain_along_the_path() -> None:
-    modes, moving = np.zeros((1, 4, 1)), np.zeros((1, MOTION))
+    modes, moving = np.zeros((1, 4, 1)), np.zeros((1, LEVEL.size))
     moving[0, 4] = 1.0
-    states = States(moving, 1e-8 * np.eye(MOTION)[None], np.zeros((1, MOTION, 1)))
+    states = States(moving, 1e-8 * np.eye(LEVEL.size)[None], np.zeros((1, LEVEL.size, 1)))
     seen = Sightings(np.zeros((1, 4)), 1e-8 * np.eye(4)[None], modes, np.array([[0.001]]))
     spread = compare(states, seen).covariances[0].diagonal()
     np.testing.assert_allclose(spread, [1e-6 + 2e-8, 2e-8, 2e-8, 2e-8], rtol=1e-9)

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from ipsys_log.messages import Message, Position, Positions, Rig, RigMarker, Track, Tracks
+from ipsys_log.messages import Message, Position, Positions, Rig, RigBody, RigMarker, Track, Tracks
 from ipsys_log.models.tracking.tracks import Pose, RobotTracks, TrackSettings
 from ipsys_log.stages.fuse import Fuse
 from ipsys_log.units import NS_PER_S
@@ -322,7 +322,13 @@ def test_complete_history_keeps_all_sightings_but_few_states() -> None:
 
 
 ARM_M, TURN_RAD = np.array([0.3, -0.1]), 1.2
-RIG = Rig("lab", "DICT_4X4_100", 0.2, (RigMarker(1, robot="ada"), RigMarker(2, robot="ada")))
+RIG = Rig(
+    "lab",
+    "DICT_4X4_100",
+    0.2,
+    (RigMarker(1, robot="ada"), RigMarker(2, robot="ada")),
+    bodies=(RigBody("ada", level=True),),
+)
 
 
 def positions_at(time_ns: int, ids: tuple[int, ...]) -> Positions:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ipsys_log.models.tracking.filter import MOTION, POSE, MotionNoise, Sightings, States, start, transition
+from ipsys_log.models.tracking.filter import LEVEL, MotionNoise, Sightings, States, start, transition
 from ipsys_log.models.tracking.smoothed_poses import smooth_track
 
 Array = NDArray[np.float64]
@@ -31,25 +31,25 @@ def make_sightings(seed: int, count: int) -> tuple[Array, Sightings]:
 def condition_all(durations_s: Array, sightings: Sightings) -> tuple[Array, Array]:
     """Return means (n, s) and covariances (n, s, s): one Gaussian of all states and all sightings."""
     first = start(sightings.take(np.array([0])), NOISE)
-    count, size = len(durations_s) + 1, MOTION + MODES
+    count, size = len(durations_s) + 1, LEVEL.size + MODES
     means, joint = np.zeros((count, size)), np.zeros((count, size, count, size))
-    means[0, :MOTION] = first.means[0]
+    means[0, : LEVEL.size] = first.means[0]
     joint[0, :, 0] = np.block([[first.covariances[0], -first.cross[0]], [-first.cross[0].T, np.eye(MODES)]])
     for n, duration_s in enumerate(durations_s):
         (motion,), (spread,) = transition(np.array([duration_s]), np.zeros(1), NOISE)
         forward = np.eye(size)
-        forward[:MOTION, :MOTION] = motion
+        forward[: LEVEL.size, : LEVEL.size] = motion
         means[n + 1] = forward @ means[n]
         for other in range(n + 1):
             joint[n + 1, :, other] = forward @ joint[n, :, other]
             joint[other, :, n + 1] = joint[n + 1, :, other].T
         joint[n + 1, :, n + 1] = forward @ joint[n, :, n] @ forward.T
-        joint[n + 1, :MOTION, n + 1, :MOTION] += spread
+        joint[n + 1, : LEVEL.size, n + 1, : LEVEL.size] += spread
     prior = joint.reshape(count * size, count * size)
     rows = np.zeros((count - 1, 4, count, size))
     for n in range(1, count):
-        rows[n - 1, :, n, POSE] = np.eye(4)
-        rows[n - 1, :, n, MOTION:] = sightings.sensitivities[n]
+        rows[n - 1, :, n, LEVEL.pose] = np.eye(4)
+        rows[n - 1, :, n, LEVEL.size :] = sightings.sensitivities[n]
     observed = rows.reshape(-1, count * size)
     white = np.zeros((count - 1, 4, count - 1, 4))
     for n in range(1, count):
@@ -59,7 +59,7 @@ def condition_all(durations_s: Array, sightings: Sightings) -> tuple[Array, Arra
     best = means.reshape(-1) + gain @ (sightings.poses[1:].reshape(-1) - observed @ means.reshape(-1))
     posterior = (prior - gain @ observed @ prior).reshape(count, size, count, size)
     own = np.arange(count)
-    return best.reshape(count, size)[:, :MOTION], posterior[own, :, own][:, :MOTION, :MOTION]
+    return best.reshape(count, size)[:, : LEVEL.size], posterior[own, :, own][:, : LEVEL.size, : LEVEL.size]
 
 
 def smooth_whole(sightings: Sightings, durations_s: Array, block: int = 5) -> States:

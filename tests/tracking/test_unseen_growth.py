@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ipsys_log.models.tracking.filter import MOTION, MotionNoise, displacement, transition
+from ipsys_log.models.tracking.filter import LEVEL, MotionNoise, displacement, transition
 from ipsys_log.models.tracking.tracks import RobotTracks, TrackSettings
 from ipsys_log.units import NS_PER_S
 from tests.tracking.driving import MS, NOISE_M, NOISE_RAD, START_NS, arrays, follow, sight
@@ -31,11 +31,11 @@ def drive_at_random(acceleration_m_s2: float, count: int, rng: np.random.Generat
     (forward,), (spread,) = transition(
         np.array([STEP_S]), np.zeros(1), MotionNoise(acceleration_m_s2, 0.0, turn_rad_s2=1e-3)
     )
-    root = np.linalg.cholesky(spread + 1e-18 * np.eye(MOTION))
-    states = np.zeros((count, ROBOTS, MOTION))
+    root = np.linalg.cholesky(spread + 1e-18 * np.eye(LEVEL.size))
+    states = np.zeros((count, ROBOTS, LEVEL.size))
     states[0, :, 8:10] = acceleration_m_s2 * rng.standard_normal((ROBOTS, 2))
     for step in range(1, count):
-        states[step] = states[step - 1] @ forward.T + rng.standard_normal((ROBOTS, MOTION)) @ root.T
+        states[step] = states[step - 1] @ forward.T + rng.standard_normal((ROBOTS, LEVEL.size)) @ root.T
     return states
 
 

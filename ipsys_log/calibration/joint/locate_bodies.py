@@ -149,7 +149,9 @@ class _Rounds:
             part.reshape(count, candidates, markers * 8, *part.shape[2:]) for part in now
         )
         by_twist = by_pose * self._by_time_s * self._seen.twist_sigmas[:, None, None]
-        weights = np.linalg.inv(self._variances + by_twist @ by_twist.swapaxes(-1, -2))
+        weights = np.asarray(
+            np.linalg.inv(self._variances + by_twist @ by_twist.swapaxes(-1, -2)), np.float64
+        )
         chi2 = (residuals * (weights @ residuals[..., None])[..., 0]).sum(axis=-1)
         return _Look(points_m, turns, residuals, by_pose, by_camera, weights, chi2)
 
@@ -161,7 +163,7 @@ class _Rounds:
             across = now.by_pose.swapaxes(-1, -2) @ now.weights
             normal, gradient = across @ now.by_pose, across @ now.residuals[..., None]
             normal[..., _AXES, _AXES] *= 1 + damping[..., None]
-            step = np.linalg.solve(normal, gradient)
+            step = np.asarray(np.linalg.solve(normal, gradient), dtype=np.float64)
             expected = (step * gradient).sum(axis=(-1, -2))
             turned = rotate(-step[..., 3:, 0].reshape(-1, 3)).reshape(turns.shape) @ now.turns
             tried = self.look(now.points_m - step[..., :3, 0], turned)
@@ -176,7 +178,7 @@ class _Rounds:
         """Return the poses (b, 3), (b, 3, 3) after one more step, with their uncertainties."""
         now = _Look(*(part[:, 0] for part in self.look(points_m[:, None], turns[:, None])))
         across = now.by_pose.swapaxes(1, 2) @ now.weights
-        noise = np.linalg.inv(across @ now.by_pose)
+        noise = np.asarray(np.linalg.inv(across @ now.by_pose), dtype=np.float64)
         gains = noise @ across
         change = (gains @ now.residuals[:, :, None])[:, :, 0]
         left = now.residuals - (now.by_pose @ change[:, :, None])[:, :, 0]
@@ -233,7 +235,7 @@ def _prior_cost(turns: Array, seen: BodySightings) -> Array:
 def _angles(first: Array, second: Array) -> Array:
     """Return the angles (...) between rotations (..., 3, 3)."""
     traces = (first * second).sum(axis=(-1, -2))
-    return np.arccos(np.clip((traces - 1) / 2, -1.0, 1.0))
+    return np.asarray(np.arccos(np.clip((traces - 1) / 2, -1.0, 1.0)))
 
 
 # A grid of bodies in the view of a camera: shares of its principal point, and of its height.

@@ -2,7 +2,8 @@
 
 It is a Schmidt-Kalman filter: the m amplitudes of the calibration (``bias_modes.py``) stay
 independent standard normal numbers. The filter knows how the error of a state depends on them, and does not
-estimate them. All functions take k robots at once, each at its own time.
+estimate them. All functions take k robots at once, each at its own time. Level robots and free bodies have
+the same equations and other columns, see :class:`Layout`.
 """
 
 from __future__ import annotations
@@ -14,10 +15,39 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.messages import Array
+from ipsys_log.vision.poses import rotate, rotation_vectors
 
-# Columns of the state: x, y, z in m and heading in rad; their rates; the acceleration in x and y.
-POSE, RATES, ACCELERATION = slice(0, 4), slice(4, 8), slice(8, 10)
-MOTION = 10
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """The columns of a state: the pose, its rates, and the acceleration along the first ``accelerated`` axes.
+
+    The pose of a level robot is x, y, z in m and the heading in rad. That of a free body is x, y, z and a
+    turn about the axes of the world, which is 0: the rotation itself is in ``States.turns``.
+    """
+
+    columns: int
+    accelerated: int
+
+    @property
+    def pose(self) -> slice:
+        return slice(0, self.columns)
+
+    @property
+    def rates(self) -> slice:
+        return slice(self.columns, 2 * self.columns)
+
+    @property
+    def acceleration(self) -> slice:
+        return slice(2 * self.columns, self.size)
+
+    @property
+    def size(self) -> int:
+        return 2 * self.columns + self.accelerated
+
+
+LEVEL, FREE = Layout(4, 2), Layout(6, 3)
+_TURN = slice(3, 6)
 # Gauss-Legendre nodes on 0 to 1: the integrals of the noise are exact to 1e-9 for up to 1 s.
 _NODES, _WEIGHTS = (values / 2 for values in np.polynomial.legendre.leggauss(7))
 _NODES_AND_END = np.append(_NODES + 0.5, 1.0)
@@ -32,8 +62,8 @@ class MotionNoise:
     acceleration_m_s2, bend_rad_s, hold_s : standard deviation of the acceleration along each axis of the
         floor, for a robot that stands; its growth with the speed, because the acceleration in a bend is the
         product of speed and turn rate; its correlation time.
-    turn_rad_s2, climb_m_s2 : changes of the turn rate and of the vertical speed: square root of the density
-        of white noise, as their standard deviation after one second.
+    turn_rad_s2, climb_m_s2 : changes of the turn rate and, for a level robot, of the vertical speed: square
+        root of the density of white noise, as their standard deviation after one second.
     start_m_s, start_climb_m_s, start_rad_s, start_acceleration_m_s2 : standard deviations of a new track: of
         the velocity on the floor, the vertical speed, the turn rate, and the acceleration.
     """
@@ -49,8 +79,16 @@ class MotionNoise:
     start_acceleration_m_s2: float = 1.5
 
 
+# A body that is carried or that flies.
+FREE_MOTION = MotionNoise(1.5, 1.5, 0.3, 6.0, 0.0, 1.0, 1.0, 2.0, 3.0)
+
+
 def transition(
-    durations_s: Array, speeds_m_s: Array, noise: MotionNoise, scales: Array | None = None
+    durations_s: Array,
+    speeds_m_s: Array,
+    noise: MotionNoise,
+    scales: Array | None = None,
+    layout: Layout = LEVEL,
 ) -> tuple[Array, Array]:
     """Return the transitions of the state and the covariances of its noise.
 
@@ -59,14 +97,15 @@ def transition(
     Parameters
     ----------
     durations_s : (k,), at least 0.
-    speeds_m_s : (k,), speeds on the floor.
+    speeds_m_s : (k,), speeds on the floor, or of a free body.
     noise : the usual motion.
     scales : (k,), factors of the variance of the acceleration; None for the usual one.
+    layout : the s columns of the state.
 
     Returns
     -------
-    transitions : (k, 10, 10).
-    covariances : (k, 10, 10).
+    transitions : (k, s, s).
+    covariances : (k, s, s).
 
     References
     ----------
@@ -77,10 +116,12 @@ def transition(
     if scales is not None:
         variances = variances * scales[:, None, None]
     if count and (durations_s == durations_s[0]).all():  # mostly, for the robots of one message
-        forward, other, by_acceleration = _steps(durations_s[:1], noise)
-        return np.broadcast_to(forward, (count, MOTION, MOTION)), other + variances * by_acceleration
+        forward, other, by_acceleration = _steps(durations_s[:1], noise, layout)
+        return np.broadcast_to(
+            forward, (count, layout.size, layout.size)
+        ), other + variances * by_acceleration
     durations_s, places = np.unique(durations_s, return_inverse=True)
-    forward, other, by_acceleration = _steps(durations_s, noise)
+    forward, other, by_acceleration = _steps(durations_s, noise, layout)
     return forward[places], other[places] + variances * by_acceleration[places]
 
 
@@ -110,29 +151,32 @@ def displacement(duration_s: float, hold_s: float) -> tuple[float, float]:
     return by_acceleration_m, hold_s**4 * parts
 
 
-def _steps(durations_s: Array, noise: MotionNoise) -> tuple[Array, Array, Array]:
+def _steps(durations_s: Array, noise: MotionNoise, layout: Layout) -> tuple[Array, Array, Array]:
     """Return transitions, and covariances: of turn rate and climb, and of an acceleration of 1 m/s^2.
 
-    All are (k, 10, 10).
+    All are (k, s, s).
     """
-    forward, other, by_acceleration = np.zeros((3, len(durations_s), MOTION, MOTION))
+    size, rates = layout.size, layout.columns
+    forward, other, by_acceleration = np.zeros((3, len(durations_s), size, size))
     # Flat, because slices are faster than pairs of indexes: the diagonal, and the poses by their rates.
-    flat = forward.reshape(-1, MOTION**2)
-    flat[:, : 8 * (MOTION + 1) : MOTION + 1] = 1.0
-    flat[:, 4 : 4 * (MOTION + 1) : MOTION + 1] = durations_s[:, None]
+    flat = forward.reshape(-1, size**2)
+    flat[:, : 2 * rates * (size + 1) : size + 1] = 1.0
+    flat[:, rates : rates * (size + 1) : size + 1] = durations_s[:, None]
     effects = _of_acceleration(durations_s[:, None] * _NODES_AND_END, noise.hold_s)
     by_position, by_velocity, rest = effects[:, :, -1].T
     weights = (2 / noise.hold_s * durations_s)[:, None] * _WEIGHTS
     unit = (effects[:, :, :-1] * weights[:, None]) @ effects[:, :, :-1].swapaxes(1, 2)
-    for axis in (0, 1):
-        own = 8 + axis
-        forward[:, axis, own], forward[:, 4 + axis, own] = by_position, by_velocity
+    for axis in range(layout.accelerated):
+        own = 2 * rates + axis
+        forward[:, axis, own], forward[:, rates + axis, own] = by_position, by_velocity
         forward[:, own, own] = rest
-        by_acceleration[:, axis : own + 1 : 4, axis : own + 1 : 4] = unit
-    for axis, density in ((2, noise.climb_m_s2**2), (3, noise.turn_rad_s2**2)):
+        by_acceleration[:, axis : own + 1 : rates, axis : own + 1 : rates] = unit
+    climb = [(2, noise.climb_m_s2**2)] if layout is LEVEL else []
+    turns = [(axis, noise.turn_rad_s2**2) for axis in range(3, rates)]
+    for axis, density in (*climb, *turns):
         other[:, axis, axis] = density * durations_s**3 / 3
-        other[:, axis, 4 + axis] = other[:, 4 + axis, axis] = density * durations_s**2 / 2
-        other[:, 4 + axis, 4 + axis] = density * durations_s
+        other[:, axis, rates + axis] = other[:, rates + axis, axis] = density * durations_s**2 / 2
+        other[:, rates + axis, rates + axis] = density * durations_s
     return forward, other, by_acceleration
 
 
@@ -152,8 +196,6 @@ def _of_acceleration(durations_s: Array, hold_s: float) -> Array:
 # The variance of a heading that was not measured: it has no weight in double precision.
 UNKNOWN_RAD2 = 1e6
 _START_HEADING_RAD2 = np.pi**2
-# The velocity and the acceleration on the floor.
-_MOVING = [4, 5, 8, 9]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -162,30 +204,50 @@ class States:
 
     Attributes
     ----------
-    means : (k, 10). Headings are continuous: they can be outside of one turn.
-    covariances : (k, 10, 10), of all errors, those of the calibration included.
-    cross : (k, 10, m), errors (estimate minus truth) by the amplitudes of the calibration. The covariance of
+    means : (k, s). Headings are continuous: they can be outside of one turn.
+    covariances : (k, s, s), of all errors, those of the calibration included.
+    cross : (k, s, m), errors (estimate minus truth) by the amplitudes of the calibration. The covariance of
         two states by their calibration is the product of their rows.
     fade_m : (m,), distance after which a robot meets other amplitudes, see
         :class:`ipsys_log.models.tracking.bias_modes.BiasModes`. None if all are constant.
+    turns : (k, 3, 3), rotations from the axes of free bodies to those of the world; None for level robots.
     """
 
     means: Array
     covariances: Array
     cross: Array
     fade_m: Array | None = None
+    turns: Array | None = None
+
+    @property
+    def layout(self) -> Layout:
+        """The columns of the states."""
+        return LEVEL if self.turns is None else FREE
 
     def take(self, rows: NDArray[np.intp]) -> States:
         """Return the states of some robots; themselves for all of them in their order."""
         if _are_all(rows, len(self.means)):
             return self
-        return States(self.means[rows], self.covariances[rows], self.cross[rows], self.fade_m)
+        turns = None if self.turns is None else self.turns[rows]
+        return States(self.means[rows], self.covariances[rows], self.cross[rows], self.fade_m, turns)
 
     def replace(self, rows: NDArray[np.intp], states: States) -> States:
         """Return the states with those of some robots replaced."""
         means, covariances, cross = self.means.copy(), self.covariances.copy(), self.cross.copy()
         means[rows], covariances[rows], cross[rows] = states.means, states.covariances, states.cross
-        return States(means, covariances, cross, self.fade_m)
+        turns = None
+        if self.turns is not None:
+            turns = self.turns.copy()
+            turns[rows] = states.turns
+        return States(means, covariances, cross, self.fade_m, turns)
+
+    def turned(self) -> States:
+        """Return the states with the turns of their means in their rotations."""
+        if self.turns is None:
+            return self
+        turns, means = rotate(self.means[:, _TURN]) @ self.turns, self.means.copy()
+        means[:, _TURN] = 0.0
+        return States(means, self.covariances, self.cross, self.fade_m, turns)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -194,23 +256,29 @@ class Sightings:
 
     Attributes
     ----------
-    poses : (k, 4), x, y, z in m and heading in rad; a heading that was not measured is 0.
-    noise : (k, 4, 4), covariance of the noise, without the calibration; :data:`UNKNOWN_RAD2` for a heading
+    poses : (k, p), x, y, z in m and heading in rad; a heading that was not measured is 0. Of free bodies, x,
+        y, z and 0 for the turn.
+    noise : (k, p, p), covariance of the noise, without the calibration; :data:`UNKNOWN_RAD2` for a heading
         that was not measured.
-    sensitivities : (k, 4, m), errors of the poses by the amplitudes of the calibration.
+    sensitivities : (k, p, m), errors of the poses by the amplitudes of the calibration.
     clock_s : (k, m), errors of the times by the amplitudes of the calibration.
+    turns : (k, 3, 3), rotations of free bodies; None for level robots.
     """
 
     poses: Array
     noise: Array
     sensitivities: Array
     clock_s: Array
+    turns: Array | None = None
 
     def take(self, rows: NDArray[np.intp]) -> Sightings:
         """Return the sightings of some robots; themselves for all of them in their order."""
         if _are_all(rows, len(self.poses)):
             return self
-        return Sightings(self.poses[rows], self.noise[rows], self.sensitivities[rows], self.clock_s[rows])
+        turns = None if self.turns is None else self.turns[rows]
+        return Sightings(
+            self.poses[rows], self.noise[rows], self.sensitivities[rows], self.clock_s[rows], turns
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -219,10 +287,10 @@ class Innovations:
 
     Attributes
     ----------
-    differences : (k, 4), sighting minus prediction, in m and rad; 0 for a heading that was not measured.
-    covariances : (k, 4, 4), of the differences.
-    modes : (k, 4, m), sensitivities of the sightings with the errors of their times.
-    across : (k, 10, 4), minus the covariance of the errors of the states and the differences.
+    differences : (k, p), sighting minus prediction, in m and rad; 0 for a heading that was not measured.
+    covariances : (k, p, p), of the differences.
+    modes : (k, p, m), sensitivities of the sightings with the errors of their times.
+    across : (k, s, p), minus the covariance of the errors of the states and the differences.
     """
 
     differences: Array
@@ -244,20 +312,23 @@ def _are_all(rows: NDArray[np.intp], count: int) -> bool:
 def start(sightings: Sightings, noise: MotionNoise, fade_m: Array | None = None) -> States:
     """Return the states of new tracks, after their first sightings; ``fade_m`` as in :class:`States`."""
     count, modes = len(sightings.poses), sightings.sensitivities
-    means, covariances = np.zeros((count, MOTION)), np.zeros((count, MOTION, MOTION))
-    cross = np.zeros((count, MOTION, modes.shape[2]))
-    means[:, POSE], cross[:, POSE] = sightings.poses, modes
-    covariances[:, POSE, POSE] = sightings.noise + modes @ modes.swapaxes(1, 2)
-    unknown = sightings.noise[:, 3, 3] >= UNKNOWN_RAD2
-    covariances[unknown, 3, 3] = _START_HEADING_RAD2
+    layout = LEVEL if sightings.turns is None else FREE
+    means, covariances = np.zeros((count, layout.size)), np.zeros((count, layout.size, layout.size))
+    cross = np.zeros((count, layout.size, modes.shape[2]))
+    means[:, layout.pose], cross[:, layout.pose] = sightings.poses, modes
+    covariances[:, layout.pose, layout.pose] = sightings.noise + modes @ modes.swapaxes(1, 2)
+    if layout is LEVEL:
+        unknown = sightings.noise[:, 3, 3] >= UNKNOWN_RAD2
+        covariances[unknown, 3, 3] = _START_HEADING_RAD2
     sigmas = (
         [noise.start_m_s] * 2
-        + [noise.start_climb_m_s, noise.start_rad_s]
-        + [noise.start_acceleration_m_s2] * 2
+        + [noise.start_climb_m_s]
+        + [noise.start_rad_s] * (layout.columns - 3)
+        + [noise.start_acceleration_m_s2] * layout.accelerated
     )
-    rates = np.arange(RATES.start, ACCELERATION.stop)
+    rates = np.arange(layout.columns, layout.size)
     covariances[:, rates, rates] = np.square(sigmas)
-    return States(means, covariances, cross, fade_m)
+    return States(means, covariances, cross, fade_m, sightings.turns)
 
 
 def predict(states: States, durations_s: Array, noise: MotionNoise, scales: Array | None = None) -> States:
@@ -268,34 +339,48 @@ def predict(states: States, durations_s: Array, noise: MotionNoise, scales: Arra
     """
     if scales is not None:
         states = _scale_moving(states, scales)
-    speeds_m_s = np.hypot(states.means[:, 4], states.means[:, 5])
-    forward, spread = transition(durations_s, speeds_m_s, noise, scales)
+    layout = states.layout
+    speeds_m_s = speeds(states.means[:, layout.rates], layout)
+    forward, spread = transition(durations_s, speeds_m_s, noise, scales, layout)
     means = (forward @ states.means[:, :, None])[:, :, 0]
     covariances = forward @ states.covariances @ forward.swapaxes(1, 2) + spread
     cross = forward @ states.cross
     if states.fade_m is not None:
         cross *= np.exp(-(speeds_m_s * durations_s)[:, None, None] / states.fade_m)
-    return States(means, covariances, cross, states.fade_m)
+    return States(means, covariances, cross, states.fade_m, states.turns).turned()
+
+
+def speeds(velocities_m_s: Array, layout: Layout) -> Array:
+    """Return the speeds (k,) of velocities (k, 2 or more): of level robots only those on the floor."""
+    if layout is LEVEL:
+        return np.asarray(np.hypot(velocities_m_s[:, 0], velocities_m_s[:, 1]))
+    return np.asarray(np.linalg.norm(velocities_m_s[:, :3], axis=1))
 
 
 def _scale_moving(states: States, scales: Array) -> States:
-    roots = np.ones(states.means.shape)
-    roots[:, _MOVING] = np.sqrt(scales)[:, None]
+    layout, roots = states.layout, np.ones(states.means.shape)
+    # The velocity along the axes with an acceleration, and the acceleration.
+    for first in (layout.columns, 2 * layout.columns):
+        roots[:, first : first + layout.accelerated] = np.sqrt(scales)[:, None]
     covariances = roots[:, :, None] * states.covariances * roots[:, None]
-    return States(states.means, covariances, roots[:, :, None] * states.cross, states.fade_m)
+    return States(states.means, covariances, roots[:, :, None] * states.cross, states.fade_m, states.turns)
 
 
 def compare(states: States, sightings: Sightings) -> Innovations:
     """Return the differences of sightings from states that are predicted to the times of the sightings."""
     # A camera whose clock is late by d shows the robot v d behind.
-    modes = sightings.sensitivities - states.means[:, RATES, None] * sightings.clock_s[:, None]
-    differences = sightings.poses - states.means[:, POSE]
-    known = sightings.noise[:, 3, 3] < UNKNOWN_RAD2
-    differences[:, 3] = np.where(known, (differences[:, 3] + np.pi) % (2 * np.pi) - np.pi, 0.0)
+    pose, rates = states.layout.pose, states.layout.rates
+    modes = sightings.sensitivities - states.means[:, rates, None] * sightings.clock_s[:, None]
+    differences = sightings.poses - states.means[:, pose]
+    if states.turns is not None and sightings.turns is not None:
+        differences[:, _TURN] = rotation_vectors(sightings.turns @ states.turns.swapaxes(1, 2))
+    else:
+        known = sightings.noise[:, 3, 3] < UNKNOWN_RAD2
+        differences[:, 3] = np.where(known, (differences[:, 3] + np.pi) % (2 * np.pi) - np.pi, 0.0)
     turned = modes.swapaxes(1, 2)
     # Errors are estimate minus truth. The difference is modes b + noise - error, so a common error cancels.
-    across = states.covariances[:, :, POSE] - states.cross @ turned
-    covariances = across[:, POSE] + modes @ (turned - states.cross[:, POSE].swapaxes(1, 2)) + sightings.noise
+    across = states.covariances[:, :, pose] - states.cross @ turned
+    covariances = across[:, pose] + modes @ (turned - states.cross[:, pose].swapaxes(1, 2)) + sightings.noise
     return Innovations(differences, covariances, modes, across)
 
 
@@ -314,12 +399,13 @@ def update(states: States, sightings: Sightings, innovations: Innovations) -> St
     ----------
     Schmidt, Advances in Control Systems 3, 1966. Bucy and Joseph, Filtering for Stochastic Processes, 1968.
     """
-    across, modes = innovations.across, innovations.modes
+    across, modes, pose = innovations.across, innovations.modes, states.layout.pose
     gains = np.linalg.solve(innovations.covariances, across.swapaxes(1, 2)).swapaxes(1, 2)
     means = states.means + (gains @ innovations.differences[:, :, None])[:, :, 0]
-    # (1 - K H) P (1 - K H)' + K R K', one factor after the other, because H has only four rows.
+    # (1 - K H) P (1 - K H)' + K R K', one factor after the other, because H has few rows.
     left = states.covariances - gains @ across.swapaxes(1, 2)
-    cross = states.cross - gains @ (states.cross[:, POSE] - modes)
-    observed = left[:, :, POSE] - cross @ modes.swapaxes(1, 2)
+    cross = states.cross - gains @ (states.cross[:, pose] - modes)
+    observed = left[:, :, pose] - cross @ modes.swapaxes(1, 2)
     covariances = left + (gains @ sightings.noise - observed) @ gains.swapaxes(1, 2)
-    return States(means, (covariances + covariances.swapaxes(1, 2)) / 2, cross, states.fade_m)
+    both = (covariances + covariances.swapaxes(1, 2)) / 2
+    return States(means, both, cross, states.fade_m, states.turns).turned()

@@ -1,6 +1,6 @@
 """Sightings of robots from the positions of a frame: by robot, at their capture times, with their errors."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import isfinite
 
@@ -11,6 +11,8 @@ from ipsys_log.messages import Array, Model, Position, Rig
 from ipsys_log.models.tracking.bias_modes import BiasModes
 from ipsys_log.models.tracking.filter import UNKNOWN_RAD2, Sightings
 from ipsys_log.models.tracking.tracks import Robot
+from ipsys_log.vision.bodies import BodyShape, body_shapes, rpy_from_rotation
+from ipsys_log.vision.poses import invert_pose, make_pose, rotation, skew_matrices
 
 # An offset is used after this number of frames
 _FEWEST_FRAMES = 10
@@ -21,8 +23,10 @@ _AGREES_RAD = 0.05
 _LEAST_M, _LEAST_RAD = 1e-4, 1e-4
 # The usual noise of positions and headings that have none: a few hundredths of a pixel.
 _USUAL_M, _USUAL_RAD = 3e-4, 3e-3
-# The error of a position whose covariance is unknown.
-_UNKNOWN_M = 0.005
+# The error of a position whose covariance is unknown, and of such a rotation.
+_UNKNOWN_M, _UNKNOWN_RAD = 0.005, 0.05
+# The amplitudes of free bodies: 20 of the calibration, and one of the size.
+FREE_MODES = 21
 # No lab is larger, and no heading has a larger error.
 _FARTHEST_M, _LARGEST_RAD = 1e6, 10.0
 _PLACE, _UNKNOWN = np.arange(3), np.full((3, 3), np.nan)
@@ -56,51 +60,91 @@ class FrameReader:
         self._rig: Rig | None = None
         self._robots: dict[int, Robot] = {}
         self.modes = BiasModes.none()
-        self._bodies, self._has_bodies = _Bodies(), False
+        self._shapes: dict[int, BodyShape] = {}
+        self._offsets = _Offsets({})
 
     def use_rig(self, rig: Rig) -> None:
         """Use a rig for the next frames."""
-        names = [marker.robot for marker in rig.markers if marker.robot is not None]
-        self._rig, self._has_bodies = rig, len(names) > len(set(names))
-        self._robots = {}
+        shapes = {shape.robot: shape for shape in body_shapes(rig)}
+        self._shapes = {m.id: shapes[m.robot] for m in rig.markers if m.robot in shapes}
+        self._offsets = _Offsets({id_: one for id_, one in self._shapes.items() if one.is_level})
+        self._rig, self._robots = rig, {}
         if self._model is not None:
             # Late: the modes of a joint model need scipy.
             from ipsys_log.models.tracking.calibration_modes import calibration_modes
 
             self.modes = calibration_modes(self._model, rig)
 
-    def read(self, camera: str, time_ns: int, positions: Sequence[Position]) -> FrameSightings | None:
-        """Return the sightings of a frame of a camera at a time; None if it shows no robot."""
+    def read(self, camera: str, time_ns: int, positions: Sequence[Position]) -> Iterator[FrameSightings]:
+        """Yield the sightings of a frame of a camera at a time: of level robots, and of free bodies."""
         positions = [position for position in positions if _is_usable(position)]
-        if not positions:
-            return None
-        sightings, has_covariance = _read_sightings(camera, positions, self.modes)
-        robots = [self._robots.get(p.id) or self._robot_of(p.id) for p in positions]
-        if self._has_bodies:
-            self._bodies.learn(robots, sightings)
-            rows = [row for row, robot in enumerate(robots) if self._bodies.knows(*robot)]
-            positions, robots = [positions[row] for row in rows], [robots[row] for row in rows]
-            sightings = self._bodies.move(robots, sightings.take(np.array(rows, dtype=np.intp)))
-            has_covariance = has_covariance[rows]
-            robots = [(name, self._bodies.reference(name, number)) for name, number in robots]
-        return FrameSightings(
-            camera,
-            robots,
-            [time_ns + (position.time_offset_ns or 0) for position in positions],
-            sightings,
-            [position.inside for position in positions],
-            has_covariance.tolist(),
-        )
+        level = [position for position in positions if position.rotation_rad is None]
+        free = [position for position in positions if position.rotation_rad is not None]
+        if level:
+            sightings, has_covariance = _read_sightings(camera, level, self.modes)
+            robots = [self._robots.get(p.id) or self._robot_of(p.id) for p in level]
+            if self._offsets:
+                ids = [position.id for position in level]
+                rows = self._offsets.learn(ids, sightings)
+                level, robots = [level[row] for row in rows], [robots[row] for row in rows]
+                own = np.array(rows, dtype=np.intp)
+                sightings = self._offsets.move([ids[row] for row in rows], sightings.take(own))
+                has_covariance = has_covariance[own]
+            if level:
+                yield _frame(camera, time_ns, level, robots, sightings, has_covariance.tolist())
+        if free:
+            robots = [self._robots.get(p.id) or self._robot_of(p.id) for p in free]
+            pivots = [self._shapes[p.id].body_from_pivot if p.id in self._shapes else np.eye(4) for p in free]
+            known = [position.pose_noise is not None for position in free]
+            yield _frame(camera, time_ns, free, robots, _read_free(free, pivots), known)
 
     def _robot_of(self, marker_id: int) -> Robot:
         assert self._rig is not None
-        robot = self._robots[marker_id] = (self._rig.robot_of(marker_id), marker_id)
+        shape = self._shapes.get(marker_id)
+        number = marker_id if shape is None else shape.id
+        robot = self._robots[marker_id] = (self._rig.robot_of(marker_id), number)
         return robot
+
+
+def _frame(
+    camera: str,
+    time_ns: int,
+    positions: Sequence[Position],
+    robots: Sequence[Robot],
+    sightings: Sightings,
+    has_covariance: Sequence[bool],
+) -> FrameSightings:
+    times_ns = [time_ns + (position.time_offset_ns or 0) for position in positions]
+    inside = [position.inside for position in positions]
+    return FrameSightings(camera, robots, times_ns, sightings, inside, has_covariance)
+
+
+def _read_free(positions: Sequence[Position], pivots: Sequence[Array]) -> Sightings:
+    """Return the sightings of the pivots (4, 4) of free bodies from the positions of the bodies."""
+    count = len(positions)
+    poses, noise = np.zeros((count, 6)), np.zeros((count, 6, 6))
+    modes, turns = np.zeros((count, 7, FREE_MODES)), np.empty((count, 3, 3))
+    for row, (position, pivot) in enumerate(zip(positions, pivots, strict=True)):
+        assert position.rotation_rad is not None
+        turn = rotation(position.rotation_rad)
+        arm_m = turn @ pivot[:3, 3]
+        poses[row, :3] = np.array([position.x_m, position.y_m, position.z_m]) + arm_m
+        turns[row] = turn @ pivot[:3, :3]
+        # A turn of the body moves the pivot around its origin.
+        by_pose = np.eye(6)
+        by_pose[:3, 3:] = -skew_matrices(arm_m[None])[0]
+        unknown = np.diag(np.repeat([_UNKNOWN_M, _UNKNOWN_RAD], 3) ** 2)
+        own = unknown if position.pose_noise is None else position.pose_noise
+        noise[row] = by_pose @ own @ by_pose.T + np.diag(np.repeat([_LEAST_M, _LEAST_RAD], 3) ** 2)
+        own = np.zeros((7, 0)) if position.error_modes is None else position.error_modes.reshape(7, -1)
+        modes[row, :, : own.shape[1]] = own[:, :FREE_MODES]
+        modes[row, :6] = by_pose @ modes[row, :6]
+    return Sightings(poses, noise, modes[:, :6], modes[:, 6], turns)
 
 
 @dataclass(slots=True, eq=False)
 class _Offset:
-    """The mean pose of a marker relative to the reference marker of its robot: x, y, z and heading, (4,)."""
+    """The mean pose of a pivot in the axes of a marker: x, y, z and heading, (4,)."""
 
     mean: Array
     frames: int = 1
@@ -120,68 +164,85 @@ class _Offset:
 
 
 @dataclass(slots=True, eq=False)
-class _Bodies:
-    """The robots with several markers.
+class _Offsets:
+    """From the markers of level bodies to their pivots: x, y, z and heading, (4,), in the axes of a marker.
 
-    The first marker that is seen of a robot is its reference: the track of the robot is that of this marker.
-    The rig does not tell where the others are. Frames that show two markers of a robot do.
+    The rig has those of some markers. Frames that show another marker beside the first one of its body tell
+    where it is.
     """
 
-    references: dict[str, int] = field(default_factory=dict)
-    offsets: dict[int, _Offset] = field(default_factory=dict)
+    shapes: Mapping[int, BodyShape]
+    learned: dict[int, _Offset] = field(default_factory=dict)
+    known: dict[int, Array] = field(default_factory=dict)
 
-    def reference(self, robot: str, marker_id: int) -> int:
-        """Return the reference marker of a robot."""
-        return self.references.setdefault(robot, marker_id)
+    def __post_init__(self) -> None:
+        for marker_id, shape in self.shapes.items():
+            if marker_id in shape.corners_m:
+                body_from_marker = _marker_pose(shape.corners_m[marker_id])
+                marker_from_pivot = invert_pose(body_from_marker) @ shape.body_from_pivot
+                yaw_rad = rpy_from_rotation(marker_from_pivot[:3, :3])[2]
+                self.known[marker_id] = np.array([*marker_from_pivot[:3, 3], yaw_rad])
 
-    def learn(self, markers: Sequence[tuple[str, int]], sightings: Sightings) -> None:
-        """Learn from the sightings of one frame: of k markers, each with the name of its robot and its id."""
+    def __bool__(self) -> bool:
+        return bool(self.shapes)
+
+    def learn(self, ids: Sequence[int], sightings: Sightings) -> list[int]:
+        """Learn from the sightings of one frame; return the rows of those whose pivots are known."""
         poses, known_headings = sightings.poses, sightings.noise[:, 3, 3] < UNKNOWN_RAD2
-        rows = {marker_id: row for row, (_, marker_id) in enumerate(markers) if known_headings[row]}
+        rows = {marker_id: row for row, marker_id in enumerate(ids) if known_headings[row]}
         for marker_id, row in rows.items():
-            robot = markers[row][0]
-            reference = rows.get(self.reference(robot, marker_id))
-            if reference is None or reference == row:
+            shape = self.shapes.get(marker_id)
+            reference = None if shape is None else rows.get(shape.id)
+            if reference is None or shape is None or marker_id in shape.corners_m:
                 continue
-            offset = poses[row] - poses[reference]
-            offset[:2] = _turn(-poses[reference, 3]) @ offset[:2]
-            known = self.offsets.get(marker_id)
-            if known is None:
-                self.offsets[marker_id] = _Offset(offset)
-            else:
-                known.add(offset)
+            pivot = _add_offset(poses[reference], self.known[shape.id])
+            offset = pivot - poses[row]
+            offset[:2] = _turn(-poses[row, 3]) @ offset[:2]
+            learned = self.learned.setdefault(marker_id, _Offset(offset))
+            learned.add(offset)
+            if learned.frames >= _FEWEST_FRAMES:
+                self.known[marker_id] = learned.mean
+        return [
+            row
+            for row, marker_id in enumerate(ids)
+            if marker_id not in self.shapes or marker_id in self.known
+        ]
 
-    def knows(self, robot: str, marker_id: int) -> bool:
-        """Return whether the sighting of a marker is one of its robot's reference."""
-        known = self.offsets.get(marker_id)
-        return self.reference(robot, marker_id) == marker_id or (
-            known is not None and known.frames >= _FEWEST_FRAMES
-        )
+    def move(self, ids: Sequence[int], sightings: Sightings) -> Sightings:
+        """Return the sightings of the pivots that follow from those of markers.
 
-    def move(self, markers: Sequence[tuple[str, int]], sightings: Sightings) -> Sightings:
-        """Return the sightings of the reference markers that follow from those of known markers.
-
-        A sighting without a heading does not tell where the reference is: its noise becomes as large as the
-        distance of the markers.
+        A sighting without a heading does not tell where the pivot is: its noise becomes as large as the
+        distance to it.
         """
         poses, noise = sightings.poses.copy(), sightings.noise.copy()
         sensitivities = sightings.sensitivities.copy()
-        for row, (robot, marker_id) in enumerate(markers):
-            if self.reference(robot, marker_id) == marker_id:
+        for row, marker_id in enumerate(ids):
+            offset = self.known.get(marker_id)
+            if offset is None or not offset.any():
                 continue
-            offset = self.offsets[marker_id].mean
             if noise[row, 3, 3] >= UNKNOWN_RAD2:
                 noise[row, :2, :2] += (offset[:2] @ offset[:2]) * np.eye(2)
                 continue
-            heading_rad = poses[row, 3] - offset[3]
-            arm_m = _turn(heading_rad) @ offset[:2]
-            poses[row] -= [*arm_m, offset[2], offset[3]]
-            # A turn of the marker moves the reference around it.
+            arm_m = _turn(poses[row, 3]) @ offset[:2]
+            poses[row] = _add_offset(poses[row], offset)
+            # A turn of the marker moves the pivot around it.
             by_pose = np.eye(4)
-            by_pose[:2, 3] = arm_m[1], -arm_m[0]
+            by_pose[:2, 3] = -arm_m[1], arm_m[0]
             noise[row] = by_pose @ noise[row] @ by_pose.T
             sensitivities[row] = by_pose @ sensitivities[row]
         return Sightings(poses, noise, sensitivities, sightings.clock_s)
+
+
+def _marker_pose(corners_m: Array) -> Array:
+    """Return the pose (4, 4) of a marker on its body from its corners (4, 3)."""
+    up, left = corners_m[0] - corners_m[3], corners_m[0] - corners_m[1]
+    axes = np.stack([up, left, np.cross(up, left) / np.linalg.norm(up)], axis=1) / np.linalg.norm(up)
+    return make_pose(axes, corners_m.mean(axis=0))
+
+
+def _add_offset(pose: Array, offset: Array) -> Array:
+    """Return a pose (4,) moved by an offset (4,) in its own axes."""
+    return np.concatenate([pose[:2] + _turn(pose[3]) @ offset[:2], pose[2:] + offset[2:]])
 
 
 def _turn(angle_rad: float) -> Array:

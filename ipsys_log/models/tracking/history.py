@@ -189,7 +189,10 @@ class UnseenGrowth:
         if not place:
             return
         before = history.records[place - 1]
-        x_m, y_m, _, _, vx_m_s, vy_m_s, _, _, ax_m_s2, ay_m_s2 = before.states.means[before.state].tolist()
+        mean, layout = before.states.means[before.state].tolist(), before.states.layout
+        rate, change = layout.columns, 2 * layout.columns
+        (x_m, y_m), (vx_m_s, vy_m_s) = mean[:2], mean[rate : rate + 2]
+        ax_m_s2, ay_m_s2 = mean[change : change + 2]
         now_x_m, now_y_m = newest.states.means[newest.state, :2].tolist()
         ahead_s = (newest.time_ns - before.time_ns) / NS_PER_S
         far_m, unit_m2 = displacement(ahead_s, noise.hold_s)
@@ -201,10 +204,10 @@ class UnseenGrowth:
         own_m2 = 2 * unit_m2 * (noise.acceleration_m_s2**2 + (noise.bend_rad_s * hypot(vx_m_s, vy_m_s)) ** 2)
         known = before.states.covariances[before.state].item
         growth_m2 = own_m2 + sum(
-            ahead_s**2 * known(rate, rate)
-            + 2 * ahead_s * far_m * known(rate, rate + 4)
-            + far_m**2 * known(rate + 4, rate + 4)
-            for rate in (4, 5)
+            ahead_s**2 * known(rate + axis, rate + axis)
+            + 2 * ahead_s * far_m * known(rate + axis, change + axis)
+            + far_m**2 * known(change + axis, change + axis)
+            for axis in (0, 1)
         )
         kept, weight = 1 - 1 / _MEMORY, own_m2 / growth_m2
         self.weight = kept * self.weight + weight

@@ -12,14 +12,13 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ipsys_log.messages import Array, Model, Position, Rig
 from ipsys_log.models.tracking.filter import (
-    MOTION,
-    POSE,
-    RATES,
+    FREE,
+    LEVEL,
     UNKNOWN_RAD2,
+    Layout,
     MotionNoise,
     Sightings,
     States,
@@ -28,16 +27,53 @@ from ipsys_log.models.tracking.filter import (
 )
 from ipsys_log.models.tracking.frame_reader import FrameReader
 from ipsys_log.models.tracking.history import Sighted, combine_seen
-from ipsys_log.models.tracking.tracks import Pose, Robot, RobotTracks, TrackSettings, gather_sightings
+from ipsys_log.models.tracking.tracks import (
+    FREE_BODIES,
+    Pose,
+    Robot,
+    RobotTracks,
+    TrackSettings,
+    gather_sightings,
+)
 from ipsys_log.units import NS_PER_S
+from ipsys_log.vision.poses import rotation, rotation_vector
 
-_HEADING = 3
+_HEADING, _TURN = 3, slice(3, 6)
 # The speed of a robot is that between two sightings this long before and after: cameras differ by some mm.
 _SPEED_S = 0.1
 # Sightings of a block: 40 MB with 21 amplitudes.
 _BLOCK = 512
-# A mean (s,) and its covariance (s, s).
-_State = tuple[Array, Array]
+
+
+class _State(NamedTuple):
+    """A mean (s,), its covariance (s, s), and the rotation (3, 3) of a free body.
+
+    The turn of the mean of a free body is 0, as in :class:`~ipsys_log.models.tracking.filter.States`.
+    """
+
+    mean: Array
+    covariance: Array
+    turn: Array | None = None
+
+
+class _Block(NamedTuple):
+    """States (k, s), (k, s, s) of a block, and rotations (k, 3, 3) of a free body."""
+
+    means: Array
+    covariances: Array
+    turns: Array | None
+
+    def state(self, n: int) -> _State:
+        """Return a copy of a state: a view would keep the memory of the block."""
+        turn = None if self.turns is None else self.turns[n].copy()
+        return _State(self.means[n].copy(), self.covariances[n].copy(), turn)
+
+    def put(self, n: int, state: _State) -> None:
+        """Replace a state; a turn of its mean becomes a part of its rotation."""
+        self.means[n], self.covariances[n] = state.mean, state.covariance
+        if self.turns is not None and state.turn is not None:
+            self.turns[n] = rotation(state.mean[_TURN]) @ state.turn
+            self.means[n, _TURN] = 0.0
 
 
 def smooth_track(
@@ -72,44 +108,53 @@ def smooth_track(
     ----------
     Rauch, Tung and Striebel, AIAA Journal 1965. Covariances are sums of squares, as in the form of Joseph.
     """
-    speeds_m_s, count = _speeds(sightings.poses[:, :2], durations_s), sightings.sensitivities.shape[2]
+    layout = LEVEL if sightings.turns is None else FREE
+    count, motion = sightings.sensitivities.shape[2], layout.size
+    speeds_m_s = _speeds(sightings.poses[:, : layout.accelerated], durations_s)
 
     def steps(first: int, last: int) -> tuple[Array, Array]:
-        return _transition(durations_s[first:last], speeds_m_s[first:last], noise, fade_m, count)
+        own = slice(first, last)
+        return _transition(durations_s[own], speeds_m_s[own], noise, fade_m, count, layout)
 
     firsts = range(0, len(sightings.poses), block)
-    begins = [_begin(sightings, noise)]
+    begins = [_begin(sightings, noise, layout)]
     for first in firsts[:-1]:
-        means, covariances = _filter_block(begins[-1], sightings, first, *steps(first, first + block))
-        begins.append((means[-1].copy(), covariances[-1].copy()))
+        filtered = _filter_block(begins[-1], sightings, first, *steps(first, first + block))
+        begins.append(filtered.state(-1))
         progress(block)
     progress(len(sightings.poses) - firsts[-1])
     later = begins[-1]  # not used: the last block has no step after it
     for first, begin in zip(reversed(firsts), reversed(begins), strict=True):
         forward, spread = steps(first, first + block)
         own = len(sightings.poses[first : first + block])
-        means, covariances = _filter_block(begin, sightings, first, forward[: own - 1], spread[: own - 1])
-        later = _smooth_block(means, covariances, forward, spread, later)
-        both = (covariances + covariances.swapaxes(1, 2)) / 2
+        states = _filter_block(begin, sightings, first, forward[: own - 1], spread[: own - 1])
+        later = _smooth_block(states, forward, spread, later)
+        both = (states.covariances + states.covariances.swapaxes(1, 2)) / 2
         # Copies: a view would keep the memory of all amplitudes.
-        own_part, cross = both[:, :MOTION, :MOTION].copy(), -both[:, :MOTION, MOTION:]
+        own_part, cross = both[:, :motion, :motion].copy(), -both[:, :motion, motion:]
         progress(own)
-        yield States(means[:, :MOTION].copy(), own_part, cross)
+        yield States(states.means[:, :motion].copy(), own_part, cross, turns=states.turns)
 
 
-def _smooth_block(means: Array, covariances: Array, forward: Array, spread: Array, later: _State) -> _State:
-    """Replace the filtered states (b,) of a block by smoothed ones; return a copy of the first one.
+def _smooth_block(states: _Block, forward: Array, spread: Array, later: _State) -> _State:
+    """Replace the filtered states of a block by smoothed ones; return a copy of the first one.
 
     ``later`` is the smoothed state after the block, if there is a step from the last state to it.
     """
-    gains, rest = _gains(covariances[: len(forward)], forward, spread)
+    gains, rest = _gains(states.covariances[: len(forward)], forward, spread)
     for n in range(len(forward) - 1, -1, -1):
-        mean, covariance = (means[n + 1], covariances[n + 1]) if n + 1 < len(means) else later
-        change = mean - forward[n] @ means[n]
-        change[_HEADING] = _wrap(change[_HEADING])
-        means[n] += gains[n] @ change
-        covariances[n] = rest[n] + gains[n] @ covariance @ gains[n].T
-    return means[0].copy(), covariances[0].copy()
+        own = states.state(n)
+        after = states.state(n + 1) if n + 1 < len(states.means) else later
+        change = after.mean - forward[n] @ own.mean
+        if own.turn is None or after.turn is None:
+            change[_HEADING] = _wrap(change[_HEADING])
+        else:
+            # The mean of the later state has no turn, so the change is that of the prediction.
+            predicted = rotation(-change[_TURN]) @ own.turn
+            change[_TURN] = rotation_vector(after.turn @ predicted.T)
+        covariance = rest[n] + gains[n] @ after.covariance @ gains[n].T
+        states.put(n, _State(own.mean + gains[n] @ change, covariance, own.turn))
+    return states.state(0)
 
 
 def _speeds(points_m: Array, durations_s: Array) -> Array:
@@ -122,62 +167,74 @@ def _speeds(points_m: Array, durations_s: Array) -> Array:
     return speeds
 
 
-def _begin(sightings: Sightings, noise: MotionNoise) -> _State:
+def _begin(sightings: Sightings, noise: MotionNoise, layout: Layout) -> _State:
     """Return the state after the first sighting."""
-    first = start(sightings.take(np.array([0])), noise)
-    size = MOTION + sightings.sensitivities.shape[2]
+    first, motion = start(sightings.take(np.array([0])), noise), layout.size
+    size = motion + sightings.sensitivities.shape[2]
     mean, covariance = np.zeros(size), np.eye(size)
-    mean[:MOTION], covariance[:MOTION, :MOTION] = first.means[0], first.covariances[0]
+    mean[:motion], covariance[:motion, :motion] = first.means[0], first.covariances[0]
     # The errors of the filter are estimates minus truths.
-    covariance[:MOTION, MOTION:], covariance[MOTION:, :MOTION] = -first.cross[0], -first.cross[0].T
-    return mean, covariance
+    covariance[:motion, motion:], covariance[motion:, :motion] = -first.cross[0], -first.cross[0].T
+    return _State(mean, covariance, None if first.turns is None else first.turns[0])
 
 
-def _filter_block(
-    begin: _State, sightings: Sightings, first: int, forward: Array, spread: Array
-) -> tuple[Array, Array]:
-    """Return the means (k + 1, s) and covariances (k + 1, s, s) of a state and after the next k sightings.
+def _filter_block(begin: _State, sightings: Sightings, first: int, forward: Array, spread: Array) -> _Block:
+    """Return the states of a block: a state, and those after the next k sightings.
 
     ``begin`` is the state after the sighting ``first``.
     """
-    count, size = len(forward) + 1, len(begin[0])
-    means, covariances = np.empty((count, size)), np.empty((count, size, size))
-    means[0], covariances[0] = begin
+    count, size = len(forward) + 1, len(begin.mean)
+    turns = None if begin.turn is None else np.empty((count, 3, 3))
+    states = _Block(np.empty((count, size)), np.empty((count, size, size)), turns)
+    states.put(0, begin)
     for n in range(1, count):
-        mean = forward[n - 1] @ means[n - 1]
-        covariance = forward[n - 1] @ covariances[n - 1] @ forward[n - 1].T + spread[n - 1]
-        means[n], covariances[n] = _update(mean, covariance, sightings, first + n)
-    return means, covariances
+        before = states.state(n - 1)
+        mean = forward[n - 1] @ before.mean
+        covariance = forward[n - 1] @ before.covariance @ forward[n - 1].T + spread[n - 1]
+        states.put(n, _update(_State(mean, covariance, before.turn), sightings, first + n))
+    return states
 
 
-def _update(mean: Array, covariance: Array, sightings: Sightings, n: int) -> tuple[Array, Array]:
-    """Return the mean (s,) and the covariance (s, s) after a sighting, in the form of Joseph."""
-    noise = sightings.noise[n]
+def _update(before: _State, sightings: Sightings, n: int) -> _State:
+    """Return the state after a sighting, in the form of Joseph."""
+    mean, covariance, turn = before
+    layout, noise = LEVEL if turn is None else FREE, sightings.noise[n]
+    pose, motion = layout.pose, layout.size
     # A camera whose clock is late by d shows the robot v d behind.
-    modes = sightings.sensitivities[n] - mean[RATES, None] * sightings.clock_s[n]
-    difference = sightings.poses[n] - mean[POSE] - modes @ mean[MOTION:]
-    difference[_HEADING] = _wrap(difference[_HEADING]) if noise[_HEADING, _HEADING] < UNKNOWN_RAD2 else 0.0
-    across = covariance[:, POSE] + covariance[:, MOTION:] @ modes.T
-    gain = np.linalg.solve(across[POSE] + modes @ across[MOTION:] + noise, across.T).T
+    modes = sightings.sensitivities[n] - mean[layout.rates, None] * sightings.clock_s[n]
+    difference = sightings.poses[n] - mean[pose] - modes @ mean[motion:]
+    if turn is not None and sightings.turns is not None:
+        turn, mean = rotation(mean[_TURN]) @ turn, mean.copy()
+        mean[_TURN] = 0.0
+        difference[_TURN] = rotation_vector(sightings.turns[n] @ turn.T) - modes[_TURN] @ mean[motion:]
+    else:
+        known = noise[_HEADING, _HEADING] < UNKNOWN_RAD2
+        difference[_HEADING] = _wrap(difference[_HEADING]) if known else 0.0
+    across = covariance[:, pose] + covariance[:, motion:] @ modes.T
+    gain = np.linalg.solve(across[pose] + modes @ across[motion:] + noise, across.T).T
     left = covariance - gain @ across.T
-    observed = left[:, POSE] + left[:, MOTION:] @ modes.T
+    observed = left[:, pose] + left[:, motion:] @ modes.T
     after = left + (gain @ noise - observed) @ gain.T
-    return mean + gain @ difference, (after + after.T) / 2
+    return _State(mean + gain @ difference, (after + after.T) / 2, turn)
 
 
 def _transition(
-    durations_s: Array, speeds_m_s: Array, noise: MotionNoise, fade_m: Array | None, count: int
+    durations_s: Array,
+    speeds_m_s: Array,
+    noise: MotionNoise,
+    fade_m: Array | None,
+    count: int,
+    layout: Layout,
 ) -> tuple[Array, Array]:
     """Return the transitions (k, s, s) of motion and amplitudes, and the covariances of their noise."""
-    forward = np.broadcast_to(
-        np.eye(MOTION + count), (len(durations_s), MOTION + count, MOTION + count)
-    ).copy()
+    size = layout.size + count
+    forward = np.broadcast_to(np.eye(size), (len(durations_s), size, size)).copy()
     spread = np.zeros_like(forward)
-    own = slice(0, MOTION)
-    forward[:, own, own], spread[:, own, own] = transition(durations_s, speeds_m_s, noise)
+    own = slice(0, layout.size)
+    forward[:, own, own], spread[:, own, own] = transition(durations_s, speeds_m_s, noise, layout=layout)
     if fade_m is not None:
         kept = np.exp(-(speeds_m_s * durations_s)[:, None] / fade_m)
-        amplitudes = np.arange(MOTION, MOTION + count)
+        amplitudes = np.arange(layout.size, size)
         forward[:, amplitudes, amplitudes], spread[:, amplitudes, amplitudes] = kept, 1 - kept**2
     return forward, spread
 
@@ -239,38 +296,45 @@ def smooth_positions(
     progress : called with the share of the work after the reading of the frames: half of it is the filter of
         all frames, half the smoothing of the tracks.
     """
-    limits, reader, sources = TrackSettings(), FrameReader(model), _Sources()
+    reader, sources = FrameReader(model), _Sources()
     reader.use_rig(rig)
-    tracks = _filter(frames, reader, sources, limits, lambda share: progress(share / 2))
-    histories = [(robot, history.everything()) for robot, history in tracks.histories()]
-    count = sum(len(records) for _, records in histories)
-    smoother = _Smoother(sources, limits, reader.modes.fade_m, count, lambda share: progress((1 + share) / 2))
-    poses = [pose for robot, records in histories for pose in smoother.smooth(robot, records)]
+    both = _filter(frames, reader, sources, lambda share: progress(share / 2))
+    histories = [[(robot, one.everything()) for robot, one in tracks.histories()] for tracks in both]
+    count = sum(len(records) for own in histories for _, records in own)
+    smoother = _Smoother(sources, count, lambda share: progress((1 + share) / 2))
+    poses = [
+        pose
+        for own, settings, fade_m in zip(
+            histories, (TrackSettings(), FREE_BODIES), (reader.modes.fade_m, None), strict=True
+        )
+        for robot, records in own
+        for pose in smoother.smooth(robot, records, settings, fade_m)
+    ]
     return sorted(poses, key=lambda one: (one.pose.time_ns, str(one.pose.robot)))
 
 
 def _filter(
-    frames: Iterable[Frame],
-    reader: FrameReader,
-    sources: _Sources,
-    settings: TrackSettings,
-    progress: Callable[[float], None],
-) -> RobotTracks:
-    """Return the tracks of all frames with their complete histories; add the frames to ``sources``."""
-    tracks = RobotTracks(settings, reader.modes.fade_m, complete=True)
+    frames: Iterable[Frame], reader: FrameReader, sources: _Sources, progress: Callable[[float], None]
+) -> tuple[RobotTracks, RobotTracks]:
+    """Return the tracks of level robots and of free bodies in all frames, with their complete histories.
+
+    The frames are added to ``sources``.
+    """
+    level = RobotTracks(fade_m=reader.modes.fade_m, complete=True)
+    free = RobotTracks(FREE_BODIES, complete=True)
     waiting = sorted(frames, key=lambda one: (one.time_ns, one.camera, one.log_time_ns))
     waiting.reverse()  # each frame is forgotten when it is read
     count = len(waiting)
     while waiting:
         frame = waiting.pop()
-        seen = reader.read(frame.camera, frame.time_ns, frame.positions)
-        if seen is not None:
+        for seen in reader.read(frame.camera, frame.time_ns, frame.positions):
             sources[id(seen.sightings)] = frame.log_time_ns, seen.has_covariance
+            tracks = level if seen.sightings.turns is None else free
             tracks.observe(
                 seen.camera, seen.robots, seen.times_ns, seen.sightings, seen.inside, seen.has_covariance
             )
         progress(1 - len(waiting) / count)
-    return tracks
+    return level, free
 
 
 @dataclass(slots=True, eq=False)
@@ -278,29 +342,28 @@ class _Smoother:
     """The smoother of tracks with ``count`` sightings; ``progress`` gets the share of its work."""
 
     sources: _Sources
-    settings: TrackSettings
-    fade_m: NDArray[np.float64]
     count: int
     progress: Callable[[float], None]
     done: int = 0
 
-    def smooth(self, robot: Robot, records: Sequence[Sighted]) -> Iterator[SmoothedPose]:
+    def smooth(
+        self, robot: Robot, records: Sequence[Sighted], settings: TrackSettings, fade_m: Array | None
+    ) -> Iterator[SmoothedPose]:
         """Yield the smoothed poses of one track, the last one first."""
         times_ns = [record.time_ns for record in records]
         durations_s = np.diff(times_ns) / NS_PER_S
         end = len(records)
         for smoothed in smooth_track(
-            gather_sightings(records), durations_s, self.settings.motion, self.fade_m, progress=self._advance
+            gather_sightings(records), durations_s, settings.motion, fade_m, progress=self._advance
         ):
             first = end - len(smoothed.means)
             # A pose does not need the amplitudes.
-            states = States(smoothed.means, smoothed.covariances, np.empty((end - first, MOTION, 0)))
+            none = np.empty((end - first, smoothed.layout.size, 0))
+            states = States(smoothed.means, smoothed.covariances, none, turns=smoothed.turns)
             for place in range(end - 1, first - 1, -1):
                 # Sightings of one instant have equal states: the last one has the pose.
                 if place + 1 == len(records) or times_ns[place + 1] > times_ns[place]:
-                    window = slice(
-                        bisect_left(times_ns, times_ns[place] - self.settings.window_ns), place + 1
-                    )
+                    window = slice(bisect_left(times_ns, times_ns[place] - settings.window_ns), place + 1)
                     log_time_ns, known = self.sources[id(records[place].sightings)]
                     pose = Pose(
                         robot,

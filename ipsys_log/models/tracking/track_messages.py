@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from math import pi, sqrt
 
 import numpy as np
@@ -16,6 +16,8 @@ from ipsys_log.messages.stage import StageView
 from ipsys_log.models.tracking.filter import MotionNoise, transition
 from ipsys_log.models.tracking.tracks import Pose
 from ipsys_log.units import NS_PER_S
+from ipsys_log.vision.bodies import rpy_from_rotation
+from ipsys_log.vision.poses import rotation_vector
 from ipsys_log.vision.time_brackets import bracket_times
 
 # Columns of the motion in the state: value, rate and acceleration; the last two have white acceleration.
@@ -240,11 +242,13 @@ def track_reads(view: StageView) -> tuple[Channel, ...]:
 
 
 def tracked_part(rig: Rig, _method: str) -> object:
-    """Return the part of the rig on which tracks depend: robots, and heights of their markers."""
+    """Return the part of the rig on which tracks depend: robots, pivots, and heights of markers."""
+    poses = [(m.id, m.robot, m.xyz_m, m.rpy_rad) for m in rig.markers] if rig.bodies else []
     return (
         {(m.id, m.robot, m.height_m, m.height_sigma_m) for m in rig.markers},
         rig.marker_height_m,
         rig.marker_height_sigma_m,
+        *((rig.bodies, poses) if rig.bodies else ()),
     )
 
 
@@ -273,12 +277,18 @@ class LateFrames:
 
 def make_track(pose: Pose) -> Track:
     """Return the row of a pose; its robot is a pair of the name and the marker id."""
-    mean, covariance = pose.states.means[pose.state], pose.states.covariances[pose.state]
+    states, row = pose.states, pose.state
+    layout, mean, covariance = states.layout, states.means[row], states.covariances[row]
     robot, marker_id = pose.robot
-    x_m, y_m, z_m, heading_rad, _, _, _, turn_rate, _, _ = mean.tolist()
-    heading_sigma_rad, turn_sigma_rad_s = sqrt(covariance.item(3, 3)), sqrt(covariance.item(7, 7))
+    x_m, y_m, z_m, heading_rad = mean[:4].tolist()
+    rates, heading = layout.columns, layout.columns - 1
+    if states.turns is not None:
+        heading_rad = rpy_from_rotation(states.turns[row])[2]
+    turn_rate, turn_variance = mean.item(rates + heading), covariance.item(rates + heading, rates + heading)
+    heading_sigma_rad, turn_sigma_rad_s = sqrt(covariance.item(heading, heading)), sqrt(turn_variance)
     has_heading = heading_sigma_rad < _UNKNOWN_HEADING_RAD
-    return Track(
+    speeds = slice(rates, rates + 3)
+    track = Track(
         robot,
         marker_id,
         x_m,
@@ -288,13 +298,21 @@ def make_track(pose: Pose) -> Track:
         covariance[:3, :3] if pose.has_covariance else None,
         pose.cameras,
         pose.inside,
-        mean[4:7],
-        covariance[4:7, 4:7] if pose.has_covariance else None,
+        mean[speeds],
+        covariance[speeds, speeds] if pose.has_covariance else None,
         heading_sigma_rad if has_heading and pose.has_covariance else None,
         turn_rate if has_heading else None,
         turn_sigma_rad_s if has_heading and pose.has_covariance else None,
         pose.coasting_ns,
         pose.age_ns,
+    )
+    if states.turns is None:
+        return track
+    return replace(
+        track,
+        rotation_rad=rotation_vector(states.turns[row]),
+        pose_covariance=covariance[:6, :6] if pose.has_covariance else None,
+        angular_velocity_rad_s=mean[rates + 3 : rates + 6],
     )
 
 

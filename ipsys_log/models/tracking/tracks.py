@@ -1,6 +1,6 @@
 """Tracks of robots from the sightings of all cameras, in the order in which they arrive."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from ipsys_log.messages import Array
 from ipsys_log.models.tracking.filter import (
+    FREE_MOTION,
     Innovations,
     MotionNoise,
     Sightings,
@@ -55,6 +56,9 @@ class TrackSettings:
     coast_ns: int = NS_PER_S
     coast_m: float = 0.6
     window_ns: int = NS_PER_S // 10
+
+
+FREE_BODIES = TrackSettings(motion=FREE_MOTION)
 
 
 class Pose(NamedTuple):
@@ -126,7 +130,7 @@ class RobotTracks:
         self, settings: TrackSettings | None = None, fade_m: Array | None = None, complete: bool = False
     ) -> None:
         self._settings, self._fade_m = settings or TrackSettings(), fade_m
-        self._slack = np.diag([self._settings.slack_m**2] * 3 + [self._settings.slack_rad**2])
+        self._slack = np.array([self._settings.slack_m**2] * 3 + [self._settings.slack_rad**2] * 3)
         self._complete = complete
         self._tracks: dict[Robot, _Track] = {}
         # Instants at which another frame may still show a robot.
@@ -330,7 +334,8 @@ class RobotTracks:
 
     def _agrees(self, innovations: Innovations) -> NDArray[np.bool_]:
         """Return a mask (k,) of the sightings within the gate."""
-        return np.asarray(innovations.chi2(self._slack) < self._settings.gate)
+        slack = np.diag(self._slack[: innovations.differences.shape[1]])
+        return np.asarray(innovations.chi2(slack) < self._settings.gate)
 
     def _contradict(self, robot: Robot, track: _Track, record: Record) -> bool:
         """Add a sighting outside the gate to the rival; return whether the track starts again with it."""
@@ -382,6 +387,7 @@ def _gather(records: Sequence[Record]) -> States:
         np.array([record.states.covariances[record.state] for record in records]),
         np.array([record.states.cross[record.state] for record in records]),
         states.fade_m,
+        _stacked(record.states.turns[record.state] for record in records if record.states.turns is not None),
     )
 
 
@@ -392,4 +398,15 @@ def gather_sightings(records: Sequence[Record | Sighted]) -> Sightings:
         np.array([record.sightings.noise[record.sighting] for record in records]),
         np.array([record.sightings.sensitivities[record.sighting] for record in records]),
         np.array([record.sightings.clock_s[record.sighting] for record in records]),
+        _stacked(
+            record.sightings.turns[record.sighting]
+            for record in records
+            if record.sightings.turns is not None
+        ),
     )
+
+
+def _stacked(turns: Iterable[Array]) -> Array | None:
+    """Return rotations (3, 3) as one array; None without any, for level robots."""
+    together = list(turns)
+    return np.array(together) if together else None

@@ -21,31 +21,15 @@ from ipsys_log.models.tracking.frame_reader import FREE_MODES
 from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.bodies import BodyShape, body_shapes
 from ipsys_log.vision.lenses import undistort
-from ipsys_log.vision.poses import rotate, rotation_vector
+from ipsys_log.vision.poses import rotation_vector
 
 # The number of modes of the calibration that positions keep. The errors by the others, 0.07 mm after 75
 # calibration points, count as noise.
 MODES = FREE_MODES - 1
-# Bodies that are carried or fly: accelerations, and the largest usual speeds.
-_ACCELERATION = np.repeat([3.0, 10.0], 3)  # m/s^2, rad/s^2
-_SPEED = np.repeat([0.5, 1.5], 3)  # m/s, rad/s
-_TURN_SIGMA_RAD = 0.05
-# An older pose tells nothing of the velocity.
-_MEMORY_NS = NS_PER_S // 5
 # The quantile of one in a million of a normal distribution, for chi2 (Wilson and Hilferty, PNAS 1931).
 _RARE = 4.75
 # A marker is named after this number of successive frames in which it contradicts all others of its body.
 _LOOSE_FRAMES = 10
-
-
-@dataclass(slots=True, eq=False)
-class _Memory:
-    """The last pose of a body by a camera: the instant, the point, the rotation, and perhaps the twist."""
-
-    time_ns: int
-    point_m: Array
-    turn: Array
-    twist: Array | None = None
 
 
 @dataclass(slots=True, eq=False)
@@ -68,16 +52,11 @@ class _Seen:
 
 @dataclass(slots=True, eq=False)
 class BodyLocator:
-    """The poses of bodies in the frames of all cameras.
-
-    It remembers the last pose of a body by each camera: its rotation tells mirrored poses apart, and its
-    velocity moves the markers of a rolling shutter to one instant.
-    """
+    """The poses of bodies in the frames of all cameras; it remembers which markers came loose."""
 
     cameras: Mapping[str, JointModel]
     shapes: dict[int, BodyShape] = field(default_factory=dict)
     axes: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    memory: dict[tuple[str, str], _Memory] = field(default_factory=dict)
     loose: dict[int, int] = field(default_factory=dict)
 
     def use_rig(self, rig: Rig) -> None:
@@ -85,7 +64,6 @@ class BodyLocator:
         free = [shape for shape in body_shapes(rig) if not shape.is_level]
         ids = {shape.robot: shape for shape in free}
         self.shapes = {m.id: ids[m.robot] for m in rig.markers if m.robot in ids}
-        self.memory.clear()
         if free:
             corners_m = np.array(list(free[0].corners_m.values()))
             self.axes = strongest_modes(self.cameras.values(), corners_m, MODES)
@@ -133,7 +111,6 @@ class BodyLocator:
                 seen, poses, row, fits = parts[best], others, best, True
         for marker in seen.markers if fits else ():
             self.loose.pop(marker.id, None)
-        self._remember(camera, seen, poses, row)
         yield self._position(camera, time_ns, seen, poses, row, fits=bool(fits))
 
     def _note(self, camera: str, time_ns: int, seen: _Seen, marker_id: int) -> Iterator[Event]:
@@ -149,18 +126,6 @@ class BodyLocator:
         """Return the poses of bodies with the same number of markers."""
         model = self.cameras[camera]
         count, markers = len(bodies), [marker for seen in bodies for marker in seen.markers]
-        twists, sigmas = np.zeros((count, 6)), np.tile(_SPEED, (count, 1))
-        turns, turn_sigmas_rad = np.tile(np.eye(3), (count, 1, 1)), np.full(count, np.inf)
-        for row, seen in enumerate(bodies):
-            last = self.memory.get((camera, seen.shape.robot))
-            since_s = (seen.time_ns - last.time_ns) / NS_PER_S if last else np.inf
-            if last is None or not 0 < since_s * NS_PER_S <= _MEMORY_NS:
-                continue
-            turns[row], turn_sigmas_rad[row] = last.turn, _TURN_SIGMA_RAD + _SPEED[3] * since_s
-            if last.twist is not None:
-                # The twist is that in the middle of the last step.
-                twists[row], sigmas[row] = last.twist, np.minimum(_ACCELERATION * 1.5 * since_s, _SPEED)
-                turns[row] = rotate(last.twist[None, 3:] * since_s)[0] @ last.turn
         scales = [1.0 if seen.shape.is_measured else model.scale for seen in bodies]
         corners_m = [
             [seen.shape.corners_m[m.id] * s for m in seen.markers]
@@ -174,21 +139,8 @@ class BodyLocator:
             covariances_px2.reshape(count, -1, 8, 8),
             np.array(corners_m),
             np.array(times_s),
-            twists,
-            sigmas,
-            turns,
-            turn_sigmas_rad,
         )
         return locate_bodies(model, sightings)
-
-    def _remember(self, camera: str, seen: _Seen, poses: BodyPoses, row: int) -> None:
-        key = camera, seen.shape.robot
-        last, now = self.memory.get(key), _Memory(seen.time_ns, poses.points_m[row], poses.turns[row])
-        if last is not None and 0 < now.time_ns - last.time_ns <= _MEMORY_NS:
-            turned_rad = rotation_vector(now.turn @ last.turn.T)
-            since_s = (now.time_ns - last.time_ns) / NS_PER_S
-            now.twist = np.concatenate([now.point_m - last.point_m, turned_rad]) / since_s
-        self.memory[key] = now
 
     def _position(
         self, camera: str, time_ns: int, seen: _Seen, poses: BodyPoses, row: int, *, fits: bool

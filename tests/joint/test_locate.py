@@ -315,18 +315,7 @@ def sight_body(corners_px: Array, sigma_px: float) -> BodySightings:
     """Return the sighting of one body that stands still, whose rotation is unknown."""
     count = len(corners_px)
     covariances = np.tile(sigma_px**2 * np.eye(8), (1, count, 1, 1))
-    still = np.zeros((1, 6))
-    times = np.zeros((1, count))
-    return BodySightings(
-        corners_px[None],
-        covariances,
-        DRONE_M[None, :count],
-        times,
-        still,
-        still,
-        np.eye(3)[None],
-        np.full(1, np.inf),
-    )
+    return BodySightings(corners_px[None], covariances, DRONE_M[None, :count], np.zeros((1, count)))
 
 
 def test_pose_of_a_body_and_its_noise_agree_with_scipy(model: JointModel) -> None:
@@ -399,8 +388,8 @@ def test_moving_body_under_a_rolling_shutter_has_one_exact_pose(fit: JointFit, m
 
 
 def test_single_tilting_marker_never_has_its_mirrored_pose(fit: JointFit, model: JointModel) -> None:
-    _, errors = fly(model, joint_payload(fit, {}, 0), (0,), 0.05)
-    assert np.degrees(np.abs(np.array(errors)[:, 3:]).max()) < 4.0
+    _, errors = fly(model, joint_payload(fit, {}, 0), (0,), 0.1)
+    assert np.degrees(np.linalg.norm(np.array(errors)[:, 3:], axis=1).max()) < 5.0
 
 
 def test_loose_marker_is_named_once_and_left_out(fit: JointFit, model: JointModel) -> None:

@@ -19,6 +19,8 @@ from ipsys_log.vision.square_pose import fit_squares
 
 # A body is tilted by this standard deviation about each axis: it tells mirrored poses of one marker apart.
 _TILT_RAD = np.radians(20.0)
+# The usual velocity (m/s) and angular velocity (rad/s) of a body, along and about each axis.
+_TWIST_SIGMAS = np.repeat([0.5, 1.5], 3)
 # Two solutions that differ by less than this converge to the same pose.
 _SAME_RAD = 0.02
 _STEPS = 5
@@ -37,19 +39,12 @@ class BodySightings(NamedTuple):
     covariances_px2 : (b, k, 8, 8), of x0 y0 .. x3 y3.
     corners_m : (b, k, 4, 3), the corners in the coordinates of the bodies.
     times_s : (b, k), exposures of the markers, from the instant of the pose.
-    twists : (b, 6), velocity in m/s and angular velocity in rad/s about the axes of the world.
-    twist_sigmas : (b, 6), standard deviations of the twists.
-    likely_turns : (b, 3, 3), rotations that are expected, and ``turn_sigmas_rad`` (b,), infinite if unknown.
     """
 
     corners_px: Array
     covariances_px2: Array
     corners_m: Array
     times_s: Array
-    twists: Array
-    twist_sigmas: Array
-    likely_turns: Array
-    turn_sigmas_rad: Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,7 +55,7 @@ class BodyPoses:
     ----------
     points_m, turns : (b, 3) and (b, 3, 3), origins and axes.
     noise : (b, 6, 6), covariances of the points and of turns about the axes of the world, by the noise of the
-        corners and of the twist.
+        corners and by the velocity.
     modes : (b, 6, m), errors by the modes of the calibration.
     by_scale : (b, 6), errors by the relative error of the size of the body.
     chi2, marker_chi2 : (b,) and (b, k), squared residuals in units of the noise: of all corners, with 8 k - 6
@@ -80,8 +75,8 @@ def locate_bodies(model: JointModel, seen: BodySightings) -> BodyPoses:
     """Return the poses of bodies by weighted least squares over all corners.
 
     Each marker has two poses, and so each body has two candidates for each marker. The two best candidates
-    with different rotations are refined. The better one has the smaller sum of squared residuals, of the
-    squared tilt in units of 20 degrees, and of the squared difference from the expected rotation.
+    with different rotations are refined. The better one has the smaller sum of squared residuals and of the
+    squared tilt in units of 20 degrees.
 
     Parameters
     ----------
@@ -90,13 +85,13 @@ def locate_bodies(model: JointModel, seen: BodySightings) -> BodyPoses:
     """
     rounds, row = _Rounds(model, seen), np.arange(len(seen.corners_px))
     points_m, turns = _candidates(model, seen)
-    costs = rounds.look(points_m, turns).chi2 + _prior_cost(turns, seen)
+    costs = rounds.look(points_m, turns).chi2 + _tilt_cost(turns)
     first = costs.argmin(axis=1)
     apart = _angles(turns, turns[row, first][:, None])
     second = np.where(apart < _SAME_RAD, np.inf, costs).argmin(axis=1)
     two = np.stack([first, second], axis=1)
     now = rounds.refine(points_m[row[:, None], two], turns[row[:, None], two])
-    best = (now.chi2 + _prior_cost(now.turns, seen)).argmin(axis=1)
+    best = (now.chi2 + _tilt_cost(now.turns)).argmin(axis=1)
     return rounds.finish(now.points_m[row, best], now.turns[row, best])
 
 
@@ -115,7 +110,8 @@ class _Look(NamedTuple):
 class _Rounds:
     """The rounds of least squares for the same sightings.
 
-    The uncertain twist is marginalized: it makes the errors of markers with different exposures dependent.
+    Markers have different exposures. The unknown velocity of the body is marginalized: it makes the errors of
+    its markers dependent.
     """
 
     def __init__(self, model: JointModel, seen: BodySightings) -> None:
@@ -127,9 +123,6 @@ class _Rounds:
         own = seen.covariances_px2 + model.corner_floor_px**2 * np.eye(8)
         variances[:, number, :, number] = own.swapaxes(0, 1)
         self._variances = variances.reshape(count, 1, markers * 8, markers * 8)
-        ways = seen.twists[:, None] * seen.times_s[:, :, None]
-        self._moved_m = ways[:, None, :, :3]
-        self._turned = rotate(ways[:, :, 3:].reshape(-1, 3)).reshape(count, 1, markers, 3, 3)
         self._by_time_s = np.repeat(seen.times_s, 8, axis=1)[:, None, :, None]
 
     def look(self, points_m: Array, turns: Array) -> _Look:
@@ -137,18 +130,18 @@ class _Rounds:
         count, candidates = points_m.shape[:2]
         markers = self._seen.corners_px.shape[1]
         many = count, candidates, markers
-        arms_m = self._seen.corners_m[:, None] @ (self._turned @ turns[:, :, None]).swapaxes(-1, -2)
+        arms_m = self._seen.corners_m[:, None] @ turns[:, :, None].swapaxes(-1, -2)
         now = linearise_corners(
             self._model,
             np.broadcast_to(self._seen.corners_px[:, None], (*many, 4, 2)).reshape(-1, 4, 2),
             np.broadcast_to(self._inward, (*many, 4, 2)).reshape(-1, 4, 2),
-            (points_m[:, :, None] + self._moved_m).reshape(-1, 3),
+            np.broadcast_to(points_m[:, :, None], (*many, 3)).reshape(-1, 3),
             arms_m.reshape(-1, 4, 3),
         )
         residuals, by_pose, by_camera = (
             part.reshape(count, candidates, markers * 8, *part.shape[2:]) for part in now
         )
-        by_twist = by_pose * self._by_time_s * self._seen.twist_sigmas[:, None, None]
+        by_twist = by_pose * self._by_time_s * _TWIST_SIGMAS
         weights = np.asarray(
             np.linalg.inv(self._variances + by_twist @ by_twist.swapaxes(-1, -2)), np.float64
         )
@@ -224,12 +217,10 @@ def _candidates(model: JointModel, seen: BodySightings) -> tuple[Array, Array]:
     return points_m.reshape(count, 2 * markers, 3), turns.reshape(count, 2 * markers, 3, 3)
 
 
-def _prior_cost(turns: Array, seen: BodySightings) -> Array:
+def _tilt_cost(turns: Array) -> Array:
     """Return -2 log of the prior probability (b, c) of rotations (b, c, 3, 3)."""
-    tilts = 2 * (1 - turns[..., 2, 2]) / _TILT_RAD**2
-    apart = _angles(turns, seen.likely_turns[:, None])
-    # Beyond three standard deviations, a wrong expectation counts no more.
-    return np.asarray(tilts + np.minimum((apart / seen.turn_sigmas_rad[:, None]) ** 2, 9.0))
+    # 2 (1 - cosine) is the square of the angle, if the angle is small.
+    return np.asarray(2 * (1 - turns[..., 2, 2]) / _TILT_RAD**2)
 
 
 def _angles(first: Array, second: Array) -> Array:
@@ -283,8 +274,4 @@ def level_sightings(model: JointModel, points_m: Array, corners_m: Array) -> Bod
         np.broadcast_to(np.eye(8), (count, markers, 8, 8)),
         np.broadcast_to(corners_m, (*shape, 3)),
         np.zeros((count, markers)),
-        np.zeros((count, 6)),
-        np.zeros((count, 6)),
-        np.broadcast_to(np.eye(3), (count, 3, 3)),
-        np.full(count, np.inf),
     )

@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.messages import Floor, ReferencePoint, Rig, RigCamera, RigMarker
+from ipsys_log.messages import Floor, ReferencePoint, Rig, RigBody, RigCamera, RigMarker
 from ipsys_log.messages.rig_checks import dictionary_size
 from ipsys_log.messages.rig_file import check_rig, example_toml, load_rig, rig_toml
 from ipsys_log.plain_text import hide_password
@@ -30,10 +30,20 @@ RIG = Rig(
 )
 
 
+DRONE = replace(
+    RIG,
+    markers=(
+        RigMarker(1, robot="drone"),
+        RigMarker(2, robot="drone", xyz_m=(0.2, 0.0, -0.1), rpy_rad=(0, 0, 0.5)),
+    ),
+    bodies=(RigBody("drone", level=False, pivot_m=(0.0, 0.05, -0.1), scale_sigma=0.0002),),
+)
+
+
 def test_written_rig_reads_back(tmp_path: Path) -> None:
     path = tmp_path / "lab.toml"
     bare = replace(RIG, markers=(), cameras=(), reference_points=(), floor=None)
-    for rig in (RIG, replace(bare, marker_height_m=None, tape_sigma_m=None)):
+    for rig in (RIG, replace(bare, marker_height_m=None, tape_sigma_m=None), DRONE):
         path.write_text(rig_toml(rig))
         assert load_rig(path) == rig
 
@@ -95,6 +105,30 @@ def test_commented_examples_of_init_are_valid(tmp_path: Path) -> None:
             r"two reference points are at \(1.0, 2.0\); give each its own",
         ),
         ({"marker_length_m": 0.0}, "0.0 m is not a length"),
+        ({"markers": DRONE.markers}, r"robot 'drone' has several markers; add \[\[bodies\]\]"),
+        ({"bodies": DRONE.bodies}, "no marker has the robot 'drone'"),
+        (
+            {"markers": DRONE.markers, "bodies": (RigBody("drone", False, (50.0, 0.0, -100.0)),)},
+            r"pivot_m of drone is \[50.0, 0.0, -100.0\]; give m, at most 5",
+        ),
+        ({"bodies": (RigBody("ada", True, (0.1, 0.2)),)}, "pivot_m of ada needs three numbers"),
+        ({"bodies": (RigBody("ada", True), RigBody("ada", False))}, "two bodies have the robot 'ada'"),
+        ({"bodies": (RigBody("ada", True, scale_sigma=0.1),)}, "scale_sigma of ada is 0.1; write 0.001"),
+        (
+            {
+                "markers": (RigMarker(0, robot="ada"),),
+                "marker_height_m": None,
+                "bodies": (RigBody("ada", True),),
+            },
+            "ada is level, but its marker 0 has no height_m",
+        ),
+        (
+            {
+                "markers": tuple(RigMarker(n, robot="ada", xyz_m=(0.1, 0.0, 0.0)) for n in (1, 2)),
+                "bodies": (RigBody("ada", False),),
+            },
+            r"two markers of ada are at \(0.1, 0.0, 0.0\)",
+        ),
     ],
 )
 def test_impossible_rig_is_refused(change: dict[str, object], said: str) -> None:

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from ipsys_log.messages import Message, Position, Positions, Rig, RigBody, RigMarker, Track, Tracks
 from ipsys_log.models.tracking.tracks import Pose, RobotTracks, TrackSettings
@@ -374,3 +375,32 @@ def test_marker_of_unknown_place_does_not_move_the_robot() -> None:
     rows = tracks_of([(1,)] * 20 + [(2,)] * 20)
     assert [track.coasting_ns is None for _, track in rows[:20]] == [True] * 20
     assert all(track.coasting_ns is not None for _, track in rows[20:])
+
+
+def test_pivot_of_level_and_of_free_body_is_tracked() -> None:
+    """Both bodies stand still; the oracle is a product of poses."""
+    pivot_m = (0.1, -0.2, -0.3)
+    markers = (RigMarker(1, robot="ada"), RigMarker(2, robot="eve"))
+    bodies = (RigBody("ada", True, pivot_m, (0.0, 0.0, 0.5)), RigBody("eve", False, pivot_m, (0.1, 0.2, 0.3)))
+    turn = Rotation.from_rotvec([0.3, -0.2, 2.0])
+    level = Rotation.from_euler("z", 2.5)
+    noise = np.diag(np.repeat([1e-4, 1e-3], 3) ** 2)
+    seen = (
+        Position(1, 1.0, 2.0, 0.4, 2.5, 1e-8 * np.eye(3), heading_noise_rad=1e-3),
+        Position(2, 1.0, 2.0, 0.4, 0.0, 1e-8 * np.eye(3), rotation_rad=turn.as_rotvec(), pose_noise=noise),
+    )
+    fuse = Fuse("joint")
+    list(fuse(Message("/rig", 0, 0, Rig("lab", "DICT_4X4_100", 0.2, markers, bodies=bodies))))
+    made = list(fuse(Message("t", 1, 1, Positions(1, seen), "red")))
+    ada, eve = made[0].tracks
+    for track, own, axes in ((ada, level, "z"), (eve, turn, "xyz")):
+        expected_m = np.array([1.0, 2.0, 0.4]) + own.apply(pivot_m)
+        assert np.abs([track.x_m, track.y_m, track.z_m] - expected_m).max() < 1e-9
+        turned = own * Rotation.from_euler(axes, 0.5 if axes == "z" else [0.1, 0.2, 0.3])
+        assert np.cos(track.heading_rad - turned.as_euler("ZYX")[0]) == pytest.approx(1.0)
+    assert (Rotation.from_rotvec(eve.rotation_rad).inv() * turned).magnitude() < 1e-9
+    # A turn moves the pivot: its point is less certain than that of the body.
+    lever = np.cross(np.eye(3), turn.apply(pivot_m))
+    expected = noise[:3, :3] + lever.T @ noise[3:, 3:] @ lever
+    np.testing.assert_allclose(eve.pose_covariance[:3, :3], expected + 1e-8 * np.eye(3), rtol=0.02)
+    assert made[1].transforms[1].rotation.w == pytest.approx(abs(turned.as_quat()[3]))

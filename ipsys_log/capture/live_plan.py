@@ -210,8 +210,8 @@ def _check(
         )
     for model in models:
         check_model(model, cameras)
-        heights = [rig.height_of(marker.id) for marker in rig.markers] or [rig.marker_height_m]
-        if needs_height(model.name) and None in heights:
+        unknown = rig.without_height() if rig.markers else rig.marker_height_m is None
+        if needs_height(model.name) and unknown:
             raise IpsysError(
                 f"{model.name} needs the height of the markers above the floor: write marker_height_m into "
                 "lab.toml"

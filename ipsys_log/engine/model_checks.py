@@ -208,7 +208,7 @@ def check_heights(session: Session, request: Request, models: Sequence[str]) -> 
     rigs = [request.rig] if request.rig is not None else session.payloads(session.topics(RIG))
     for name in models:
         for rig in rigs:
-            missing = [m.id for m in rig.markers if rig.height_of(m.id) is None]
+            missing = rig.without_height()
             if needs_height(name) and (missing or (not rig.markers and rig.marker_height_m is None)):
                 which = f"marker {missing[0]}" if missing else "the markers"
                 raise IpsysError(

@@ -115,7 +115,7 @@ def _best_possible(session: Session, given: Rig | None) -> tuple[tuple[str], str
     if not has_corners(session):
         missing = "images or markers, and the log has only camera points"
     for rig in [given] if given is not None else session.payloads(session.topics(RIG))[-1:]:
-        unknown = [marker.id for marker in rig.markers if rig.height_of(marker.id) is None]
+        unknown = rig.without_height()
         if not missing and (unknown or (not rig.markers and rig.marker_height_m is None)):
             missing = f"marker_height_m of {f'marker {unknown[0]}' if unknown else 'the markers'} in the rig"
     if missing:

@@ -25,6 +25,8 @@ CONTRADICTED_HEIGHT, TILTED_MARKER = "contradicted_height", "tilted_marker"
 MIRRORED, OTHER_PRINTS = "mirrored_camera", "other_prints"
 # The kind of an event for a marker that is not where the rig places it on its body.
 LOOSE_MARKER = "loose_marker"
+# The kind of an event for a marker of a body that is not level, with a model that has no pose of it.
+FREE_BODY = "free_body"
 # The kinds of events for inputs that the measurements of the log contradict.
 CONTRADICTIONS = frozenset(
     (CALIBRATION_CONTRADICTED, CONTRADICTED_HEIGHT, TILTED_MARKER, MIRRORED, OTHER_PRINTS, LOOSE_MARKER)

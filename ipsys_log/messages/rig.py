@@ -167,8 +167,7 @@ class Rig:
         """
         if self.is_reference(marker_id):
             return 0.0
-        body = self.body_of(marker_id)
-        if body is not None and not body.level:
+        if self.is_free(marker_id):
             return None
         for marker in self.markers:
             if marker.id == marker_id and marker.height_m is not None:
@@ -195,6 +194,15 @@ class Rig:
             return None
         robot = self.robot_of(marker_id)
         return next((body for body in self.bodies if body.robot == robot), None)
+
+    def is_free(self, marker_id: int) -> bool:
+        """Return whether a marker is on a body that is not level: it has no height."""
+        body = self.body_of(marker_id)
+        return body is not None and not body.level
+
+    def without_height(self) -> list[int]:
+        """Return the ids of the markers of level robots whose heights are unknown."""
+        return [m.id for m in self.markers if self.height_of(m.id) is None and not self.is_free(m.id)]
 
     def robot_heights_m(self) -> dict[str, float | None]:
         """Return the robots that the rig names, with the heights of their markers in m (None: unknown)."""

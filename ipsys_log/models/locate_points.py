@@ -19,7 +19,7 @@ from ipsys_log.messages import (
     Positions,
     Rig,
 )
-from ipsys_log.messages.events import CONTRADICTED_HEIGHT
+from ipsys_log.messages.events import CONTRADICTED_HEIGHT, FREE_BODY
 from ipsys_log.models.table import AppliedModel, reads_height
 from ipsys_log.models.uncertainty import HEIGHT_SIGMA_M
 from ipsys_log.units import NS_PER_S
@@ -142,7 +142,7 @@ class LocatePoints:
 
     Models that need the height of a marker get it from the rig. If the pose of a marker contradicts its
     height, they get the height of the pose, and an event names it. By eq. (3), a tilt looks like another
-    height, so that such a position is only marked as not inside.
+    height, so that such a position is only marked as not inside. Bodies that are not level have no positions.
     """
 
     def __init__(self, model: Model) -> None:
@@ -150,6 +150,7 @@ class LocatePoints:
         self._cameras = {camera.camera: AppliedModel(model.name, camera) for camera in model.cameras}
         self._rig: Rig | None = None
         self._heights = ContradictedHeights(model)
+        self._named: set[int] = set()
 
     def __call__(self, message: Message) -> Iterator[Any]:
         if isinstance(message.payload, Rig):
@@ -159,12 +160,24 @@ class LocatePoints:
             return
         applied = self._cameras.get(str(message.camera))
         if applied is not None:
-            points = message.payload.points
+            yield from self._free(message)
+            points = tuple(
+                p for p in message.payload.points if self._rig is None or not self._rig.is_free(p.id)
+            )
             heights_m = np.array([self._height(point.id) for point in points])
             sigmas_m = np.array([self._height_sigma(point.id) for point in points])
             positions, contradicted = _positions(applied, points, heights_m, sigmas_m) if points else ((), [])
             yield from self._heights(message.publish_time_ns, message.camera, contradicted)
             yield Positions(message.publish_time_ns, positions)
+
+    def _free(self, message: Message) -> Iterator[Event]:
+        """Yield an event for each marker of a free body at its first sighting."""
+        for point in message.payload.points:
+            if self._rig is not None and self._rig.is_free(point.id) and point.id not in self._named:
+                self._named.add(point.id)
+                robot = self._rig.robot_of(point.id)
+                text = f"{robot} is not level: {self._name} has no position of it; the model joint has"
+                yield Event(message.publish_time_ns, FREE_BODY, text, message.camera, point.id)
 
     def _height(self, marker_id: int) -> float:
         return _height(self._name, self._rig, marker_id) if reads_height(self._name) else 0.0

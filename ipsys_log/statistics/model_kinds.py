@@ -229,7 +229,9 @@ class PointModels:
     def place_part(self, rig: Rig) -> object:
         """Return the part of the rig on which positions depend."""
         heights = {(m.id, m.height_m, m.height_sigma_m) for m in rig.markers}
-        return rig.marker_height_m, rig.marker_height_sigma_m, heights
+        poses = [(m.id, m.robot, m.xyz_m, m.rpy_rad) for m in rig.markers]
+        bodies = (rig.bodies, poses) if rig.bodies else ()
+        return rig.marker_height_m, rig.marker_height_sigma_m, heights, *bodies
 
     def check_points(self, name: str, where: str, train_m: Array, has_corners: bool) -> None:
         """Check that a log has what a fit to points (n, 3) needs; ``where`` is the start of an error text."""
@@ -324,12 +326,7 @@ class CornerModels:
     def place_part(self, rig: Rig) -> object:
         references = {m.id for m in rig.reference_markers}
         lengths = {(m.id, m.length_m) for m in rig.markers}
-        own = _POINT_KIND.place_part(rig), rig.marker_length_m, lengths, references
-        return (
-            (*own, rig.bodies, [(m.id, m.robot, m.xyz_m, m.rpy_rad) for m in rig.markers])
-            if rig.bodies
-            else own
-        )
+        return _POINT_KIND.place_part(rig), rig.marker_length_m, lengths, references
 
     def check_points(self, name: str, where: str, train_m: Array, has_corners: bool) -> None:
         if not has_corners:

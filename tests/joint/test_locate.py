@@ -333,7 +333,8 @@ def test_pose_of_a_body_and_its_noise_agree_with_scipy(model: JointModel) -> Non
 
     solved = least_squares(misses, np.r_[found.points_m[0], np.full(3, 0.01)], xtol=1e-14, x_scale=1e-3)
     assert np.abs(solved.x - np.r_[found.points_m[0], np.zeros(3)]).max() < 2e-6
-    sigmas = np.sqrt(np.linalg.inv(solved.jac.T @ solved.jac).diagonal())
+    slopes: Array = np.array(solved.jac, dtype=np.float64)
+    sigmas = np.sqrt(np.linalg.inv(slopes.T @ slopes).diagonal())
     assert np.abs(np.sqrt(found.noise[0].diagonal()) / sigmas - 1).max() < 0.02
     assert abs(found.chi2[0] / (2 * solved.cost) - 1) < 0.01
 

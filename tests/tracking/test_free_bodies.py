@@ -77,11 +77,10 @@ def test_smoother_of_tumbling_bodies_knows_its_errors() -> None:
         rows = np.array([body])
         parts = [one.take(rows) for one in seen]
         own = Sightings(
-            *(np.concatenate([getattr(part, name) for part in parts]) for name in ("poses", "noise")),
-            *(
-                np.concatenate([getattr(part, name) for part in parts])
-                for name in ("sensitivities", "clock_s")
-            ),
+            np.concatenate([part.poses for part in parts]),
+            np.concatenate([part.noise for part in parts]),
+            np.concatenate([part.sensitivities for part in parts]),
+            np.concatenate([part.clock_s for part in parts]),
             np.concatenate([part.turns for part in parts if part.turns is not None]),
         )
         for block in (7, STEPS):

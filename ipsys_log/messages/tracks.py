@@ -22,7 +22,7 @@ class Position:
 
     The position of a body that is not level is that of its origin, with the id of its first marker. It has
     the rotation vector ``rotation_rad`` from the axes of the body to those of the world, its ``pose_noise``,
-    and ``error_modes`` (7 * n,), see ``schemas/ipsys/v1/positions.proto``.
+    ``error_modes`` (7 * n,) and ``error_by_motion``, see ``schemas/ipsys/v1/positions.proto``.
     """
 
     id: int
@@ -38,6 +38,7 @@ class Position:
     rotation_rad: Vec3 | None = None
     pose_noise: Mat66 | None = None
     error_modes: Floats | None = None
+    error_by_motion: Mat66 | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -9,6 +9,7 @@ import numpy as np
 
 from ipsys_log.calibration.joint.locate import corner_covariances
 from ipsys_log.calibration.joint.locate_bodies import (
+    TWIST_SIGMAS,
     BodyPoses,
     BodySightings,
     locate_bodies,
@@ -55,13 +56,14 @@ class BodyLocator:
     """The poses of bodies in the frames of all cameras; it remembers which markers came loose."""
 
     cameras: Mapping[str, JointModel]
+    rig: Rig | None = None
     shapes: dict[int, BodyShape] = field(default_factory=dict)
     axes: Array = field(default_factory=lambda: np.zeros((0, 0)))
     loose: dict[int, int] = field(default_factory=dict)
 
     def use_rig(self, rig: Rig) -> None:
         """Use the bodies of a rig for the next frames."""
-        free = [shape for shape in body_shapes(rig) if not shape.is_level]
+        self.rig, free = rig, [shape for shape in body_shapes(rig) if not shape.is_level]
         ids = {shape.robot: shape for shape in free}
         self.shapes = {m.id: ids[m.robot] for m in rig.markers if m.robot in ids}
         if free:
@@ -131,14 +133,18 @@ class BodyLocator:
             [seen.shape.corners_m[m.id] * s for m in seen.markers]
             for s, seen in zip(scales, bodies, strict=True)
         ]
-        times_s = [[(t - seen.time_ns) / NS_PER_S for t in seen.times_ns] for seen in bodies]
+        times_s = np.array([[(t - seen.time_ns) / NS_PER_S for t in seen.times_ns] for seen in bodies])
         pixels = np.array([marker.corners_px for marker in markers], dtype=np.float64)
+        rows = pixels[..., 1].reshape(count, -1, 4)
+        known_s = (self.rig.camera(camera).row_time_ns or 0) / NS_PER_S if self.rig else 0.0
+        rows_s = (rows - rows.mean(axis=2, keepdims=True)) * (known_s + model.row_time_s)
         covariances_px2 = corner_covariances([marker.covariance_px2 for marker in markers])
         sightings = BodySightings(
             pixels.reshape(count, -1, 4, 2),
             covariances_px2.reshape(count, -1, 8, 8),
             np.array(corners_m),
-            np.array(times_s),
+            times_s[:, :, None] + rows_s,
+            at_one_instant=known_s > 0,
         )
         return locate_bodies(model, sightings)
 
@@ -150,11 +156,13 @@ class BodyLocator:
         all_modes, turn = poses.modes[row], poses.turns[row]
         kept = all_modes @ self.axes
         others = all_modes @ all_modes.T - kept @ kept.T
-        noise = poses.noise[row] + others
+        noise, by_motion = poses.noise[row] + others, poses.by_twist[row]
+        usual = by_motion * TWIST_SIGMAS
         by_scale = poses.by_scale[row][:, None] * shape.scale_sigma
         clock_s = np.append(model.modes[len(model.lens) + 7] @ self.axes, 0.0)
         modes = np.vstack([np.hstack([kept, by_scale]), clock_s])
-        covariance = noise + modes[:6] @ modes[:6].T
+        own = noise + usual @ usual.T
+        covariance = own + modes[:6] @ modes[:6].T
         x_m, y_m, z_m = poses.points_m[row].tolist()
         # A turn about the vertical changes the direction of the x axis by as much.
         heading_rad = float(np.arctan2(turn[1, 0], turn[0, 0]))
@@ -167,11 +175,12 @@ class BodyLocator:
             covariance[:3, :3],
             fits and model.is_certain and not any(marker.contradicted for marker in seen.markers),
             seen.time_ns - time_ns or None,
-            noise[:3, :3],
-            float(np.sqrt(noise[5, 5])),
+            own[:3, :3],
+            float(np.sqrt(own[5, 5])),
             rotation_vector(turn),
             (noise + noise.T) / 2,
             modes.ravel(),
+            by_motion,
         )
 
 

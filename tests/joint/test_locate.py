@@ -315,7 +315,7 @@ def sight_body(corners_px: Array, sigma_px: float) -> BodySightings:
     """Return the sighting of one body that stands still, whose rotation is unknown."""
     count = len(corners_px)
     covariances = np.tile(sigma_px**2 * np.eye(8), (1, count, 1, 1))
-    return BodySightings(corners_px[None], covariances, DRONE_M[None, :count], np.zeros((1, count)))
+    return BodySightings(corners_px[None], covariances, DRONE_M[None, :count], np.zeros((1, count, 4)), True)
 
 
 def test_pose_of_a_body_and_its_noise_agree_with_scipy(model: JointModel) -> None:

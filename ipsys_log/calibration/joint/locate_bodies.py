@@ -14,13 +14,13 @@ from ipsys_log.calibration.lens_models import project_points
 from ipsys_log.messages import Array, Mask
 from ipsys_log.vision.lenses import undistort
 from ipsys_log.vision.markers import pixel_slopes
-from ipsys_log.vision.poses import rotate
+from ipsys_log.vision.poses import cross, rotate, skew_matrices
 from ipsys_log.vision.square_pose import fit_squares
 
 # A body is tilted by this standard deviation about each axis: it tells mirrored poses of one marker apart.
 _TILT_RAD = np.radians(20.0)
 # The usual velocity (m/s) and angular velocity (rad/s) of a body, along and about each axis.
-_TWIST_SIGMAS = np.repeat([0.5, 1.5], 3)
+TWIST_SIGMAS = np.repeat([0.5, 1.5], 3)
 # Two solutions that differ by less than this converge to the same pose.
 _SAME_RAD = 0.02
 _STEPS = 5
@@ -38,13 +38,16 @@ class BodySightings(NamedTuple):
     corners_px : (b, k, 4, 2), in px of the raw image, in OpenCV's order.
     covariances_px2 : (b, k, 8, 8), of x0 y0 .. x3 y3.
     corners_m : (b, k, 4, 3), the corners in the coordinates of the bodies.
-    times_s : (b, k), exposures of the markers, from the instant of the pose.
+    times_s : (b, k, 4), exposures of the rows of the corners, from the instant of the pose.
+    at_one_instant : detection knew the row time: the corners of a marker are those at their mean time, except
+        for its motion out of its plane.
     """
 
     corners_px: Array
     covariances_px2: Array
     corners_m: Array
     times_s: Array
+    at_one_instant: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,7 +58,9 @@ class BodyPoses:
     ----------
     points_m, turns : (b, 3) and (b, 3, 3), origins and axes.
     noise : (b, 6, 6), covariances of the points and of turns about the axes of the world, by the noise of the
-        corners and by the velocity.
+        corners.
+    by_twist : (b, 6, 6), errors by the velocity (m/s) and the angular velocity (rad/s) of the body along and
+        about the axes of the world: rows with other exposures show it at another pose.
     modes : (b, 6, m), errors by the modes of the calibration.
     by_scale : (b, 6), errors by the relative error of the size of the body.
     chi2, marker_chi2 : (b,) and (b, k), squared residuals in units of the noise: of all corners, with 8 k - 6
@@ -65,6 +70,7 @@ class BodyPoses:
     points_m: Array
     turns: Array
     noise: Array
+    by_twist: Array
     modes: Array
     by_scale: Array
     chi2: Array
@@ -96,12 +102,16 @@ def locate_bodies(model: JointModel, seen: BodySightings) -> BodyPoses:
 
 
 class _Look(NamedTuple):
-    """Candidates (b, c, 3), (b, c, 3, 3), their residuals (b, c, 8 k), slopes, weights and chi2 (b, c)."""
+    """Candidates (b, c, 3), (b, c, 3, 3), their residuals (b, c, 8 k), slopes, weights and chi2 (b, c).
+
+    The slopes (b, c, 8 k, ...) are those by the pose, by the twist and by the unknowns of the camera.
+    """
 
     points_m: Array
     turns: Array
     residuals: Array
     by_pose: Array
+    by_twist: Array
     by_camera: Array
     weights: Array
     chi2: Array
@@ -110,8 +120,8 @@ class _Look(NamedTuple):
 class _Rounds:
     """The rounds of least squares for the same sightings.
 
-    Markers have different exposures. The unknown velocity of the body is marginalized: it makes the errors of
-    its markers dependent.
+    The rows of the corners have different exposures. The unknown velocity of the body makes their errors
+    dependent.
     """
 
     def __init__(self, model: JointModel, seen: BodySightings) -> None:
@@ -123,7 +133,6 @@ class _Rounds:
         own = seen.covariances_px2 + model.corner_floor_px**2 * np.eye(8)
         variances[:, number, :, number] = own.swapaxes(0, 1)
         self._variances = variances.reshape(count, 1, markers * 8, markers * 8)
-        self._by_time_s = np.repeat(seen.times_s, 8, axis=1)[:, None, :, None]
 
     def look(self, points_m: Array, turns: Array) -> _Look:
         """Return the residuals, slopes and weights of candidates (b, c, 3), (b, c, 3, 3)."""
@@ -141,12 +150,34 @@ class _Rounds:
         residuals, by_pose, by_camera = (
             part.reshape(count, candidates, markers * 8, *part.shape[2:]) for part in now
         )
-        by_twist = by_pose * self._by_time_s * _TWIST_SIGMAS
-        weights = np.asarray(
-            np.linalg.inv(self._variances + by_twist @ by_twist.swapaxes(-1, -2)), np.float64
-        )
+        by_corner = by_pose[..., :3].reshape(*many, 4, 2, 3)
+        by_twist = (by_corner @ self._motion(arms_m)).reshape(by_pose.shape)
+        usual = by_twist * TWIST_SIGMAS
+        variances = self._variances + usual @ usual.swapaxes(-1, -2)
+        weights = np.asarray(np.linalg.inv(variances), dtype=np.float64)
         chi2 = (residuals * (weights @ residuals[..., None])[..., 0]).sum(axis=-1)
-        return _Look(points_m, turns, residuals, by_pose, by_camera, weights, chi2)
+        return _Look(points_m, turns, residuals, by_pose, by_twist, by_camera, weights, chi2)
+
+    def _motion(self, arms_m: Array) -> Array:
+        """Return the motion of corners (b, c, k, 4, 3, 6) by the twist, until their exposures.
+
+        ``arms_m`` (b, c, k, 4, 3) are the vectors from the origin of the body to the corners.
+        """
+        times_s = self._seen.times_s[:, None, :, :, None, None]
+        moved = np.concatenate([np.broadcast_to(np.eye(3), (*arms_m.shape, 3)), -_skew(arms_m)], axis=-1)
+        if not self._seen.at_one_instant:
+            return np.asarray(times_s * moved)
+        # The motion at the mean time of the marker, and that out of its plane from there to the row.
+        middle_m = arms_m.mean(axis=3, keepdims=True)
+        normal = cross(arms_m[..., 1, :] - arms_m[..., 0, :], arms_m[..., 0, :] - arms_m[..., 3, :])
+        normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+        out = normal[..., None, :, None] * normal[..., None, None, :]
+        tilt = -_skew(arms_m - middle_m) @ (np.eye(3) - out)
+        out_of_plane = np.concatenate(
+            [np.broadcast_to(out, tilt.shape), -out @ _skew(middle_m) + tilt], axis=-1
+        )
+        middle_s = times_s.mean(axis=3, keepdims=True)
+        return np.asarray(middle_s * moved + (times_s - middle_s) * out_of_plane)
 
     def refine(self, points_m: Array, turns: Array) -> _Look:
         """Return candidates after Levenberg-Marquardt steps."""
@@ -171,8 +202,7 @@ class _Rounds:
         """Return the poses (b, 3), (b, 3, 3) after one more step, with their uncertainties."""
         now = _Look(*(part[:, 0] for part in self.look(points_m[:, None], turns[:, None])))
         across = now.by_pose.swapaxes(1, 2) @ now.weights
-        noise = np.asarray(np.linalg.inv(across @ now.by_pose), dtype=np.float64)
-        gains = noise @ across
+        gains = np.asarray(np.linalg.solve(across @ now.by_pose, across), dtype=np.float64)
         change = (gains @ now.residuals[:, :, None])[:, :, 0]
         left = now.residuals - (now.by_pose @ change[:, :, None])[:, :, 0]
         by_camera = -(gains @ now.by_camera)
@@ -180,12 +210,18 @@ class _Rounds:
         return BodyPoses(
             points_m - change[:, :3],
             rotate(-change[:, 3:]) @ turns,
-            noise,
+            gains @ self._variances[:, 0] @ gains.swapaxes(1, 2),
+            gains @ now.by_twist,
             by_camera @ self._model.modes,
             by_camera[:, :, -1] * self._model.scale,
             squares.sum(axis=1),
             squares.reshape(len(left), -1, 8).sum(axis=2),
         )
+
+
+def _skew(vectors: Array) -> Array:
+    """Return the matrices (..., 3, 3) of the cross product with vectors (..., 3)."""
+    return skew_matrices(vectors.reshape(-1, 3)).reshape(*vectors.shape, 3)
 
 
 def _choose(better: Mask, tried: _Look, now: _Look) -> _Look:
@@ -273,5 +309,6 @@ def level_sightings(model: JointModel, points_m: Array, corners_m: Array) -> Bod
         pixels,
         np.broadcast_to(np.eye(8), (count, markers, 8, 8)),
         np.broadcast_to(corners_m, (*shape, 3)),
-        np.zeros((count, markers)),
+        np.zeros(shape),
+        at_one_instant=True,
     )

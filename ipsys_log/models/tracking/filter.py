@@ -263,6 +263,7 @@ class Sightings:
     sensitivities : (k, p, m), errors of the poses by the amplitudes of the calibration.
     clock_s : (k, m), errors of the times by the amplitudes of the calibration.
     turns : (k, 3, 3), rotations of free bodies; None for level robots.
+    by_rates : (k, p, p), errors of the poses of free bodies by the rates of their poses; None for no errors.
     """
 
     poses: Array
@@ -270,14 +271,28 @@ class Sightings:
     sensitivities: Array
     clock_s: Array
     turns: Array | None = None
+    by_rates: Array | None = None
+
+    def rows(self, values: Array, layout: Layout) -> Array:
+        """Return rows (k, p, n) of poses, with their errors by the rates, from rows (k, s, n) of states."""
+        own = values[:, layout.pose]
+        return own if self.by_rates is None else own + self.by_rates @ values[:, layout.rates]
+
+    def columns(self, values: Array, layout: Layout) -> Array:
+        """Return columns (k, n, p) of poses, as :meth:`rows`, from columns (k, n, s) of states."""
+        own = values[:, :, layout.pose]
+        if self.by_rates is None:
+            return own
+        return own + values[:, :, layout.rates] @ self.by_rates.swapaxes(1, 2)
 
     def take(self, rows: NDArray[np.intp]) -> Sightings:
         """Return the sightings of some robots; themselves for all of them in their order."""
         if _are_all(rows, len(self.poses)):
             return self
         turns = None if self.turns is None else self.turns[rows]
+        by_rates = None if self.by_rates is None else self.by_rates[rows]
         return Sightings(
-            self.poses[rows], self.noise[rows], self.sensitivities[rows], self.clock_s[rows], turns
+            self.poses[rows], self.noise[rows], self.sensitivities[rows], self.clock_s[rows], turns, by_rates
         )
 
 
@@ -328,6 +343,12 @@ def start(sightings: Sightings, noise: MotionNoise, fade_m: Array | None = None)
     )
     rates = np.arange(layout.columns, layout.size)
     covariances[:, rates, rates] = np.square(sigmas)
+    if sightings.by_rates is not None:
+        # The rates begin with 0: their errors are minus the rates, which have changed the pose.
+        own = covariances[:, layout.rates, layout.rates]
+        covariances[:, layout.pose, layout.rates] = across = -sightings.by_rates @ own
+        covariances[:, layout.rates, layout.pose] = across.swapaxes(1, 2)
+        covariances[:, layout.pose, layout.pose] -= across @ sightings.by_rates.swapaxes(1, 2)
     return States(means, covariances, cross, fade_m, sightings.turns)
 
 
@@ -369,18 +390,21 @@ def _scale_moving(states: States, scales: Array) -> States:
 def compare(states: States, sightings: Sightings) -> Innovations:
     """Return the differences of sightings from states that are predicted to the times of the sightings."""
     # A camera whose clock is late by d shows the robot v d behind.
-    pose, rates = states.layout.pose, states.layout.rates
-    modes = sightings.sensitivities - states.means[:, rates, None] * sightings.clock_s[:, None]
-    differences = sightings.poses - states.means[:, pose]
+    layout = states.layout
+    modes = sightings.sensitivities - states.means[:, layout.rates, None] * sightings.clock_s[:, None]
+    differences = sightings.poses - sightings.rows(states.means[:, :, None], layout)[:, :, 0]
     if states.turns is not None and sightings.turns is not None:
-        differences[:, _TURN] = rotation_vectors(sightings.turns @ states.turns.swapaxes(1, 2))
+        # The turn of the mean is 0: its row has only the error by the rates.
+        turned = rotate(-differences[:, _TURN]) @ states.turns
+        differences[:, _TURN] = rotation_vectors(sightings.turns @ turned.swapaxes(1, 2))
     else:
         known = sightings.noise[:, 3, 3] < UNKNOWN_RAD2
         differences[:, 3] = np.where(known, (differences[:, 3] + np.pi) % (2 * np.pi) - np.pi, 0.0)
-    turned = modes.swapaxes(1, 2)
+    transposed = modes.swapaxes(1, 2)
     # Errors are estimate minus truth. The difference is modes b + noise - error, so a common error cancels.
-    across = states.covariances[:, :, pose] - states.cross @ turned
-    covariances = across[:, pose] + modes @ (turned - states.cross[:, pose].swapaxes(1, 2)) + sightings.noise
+    across = sightings.columns(states.covariances, layout) - states.cross @ transposed
+    rest = transposed - sightings.rows(states.cross, layout).swapaxes(1, 2)
+    covariances = sightings.rows(across, layout) + modes @ rest + sightings.noise
     return Innovations(differences, covariances, modes, across)
 
 
@@ -399,13 +423,13 @@ def update(states: States, sightings: Sightings, innovations: Innovations) -> St
     ----------
     Schmidt, Advances in Control Systems 3, 1966. Bucy and Joseph, Filtering for Stochastic Processes, 1968.
     """
-    across, modes, pose = innovations.across, innovations.modes, states.layout.pose
+    across, modes, layout = innovations.across, innovations.modes, states.layout
     gains = np.linalg.solve(innovations.covariances, across.swapaxes(1, 2)).swapaxes(1, 2)
     means = states.means + (gains @ innovations.differences[:, :, None])[:, :, 0]
     # (1 - K H) P (1 - K H)' + K R K', one factor after the other, because H has few rows.
     left = states.covariances - gains @ across.swapaxes(1, 2)
-    cross = states.cross - gains @ (states.cross[:, pose] - modes)
-    observed = left[:, :, pose] - cross @ modes.swapaxes(1, 2)
+    cross = states.cross - gains @ (sightings.rows(states.cross, layout) - modes)
+    observed = sightings.columns(left, layout) - cross @ modes.swapaxes(1, 2)
     covariances = left + (gains @ sightings.noise - observed) @ gains.swapaxes(1, 2)
     both = (covariances + covariances.swapaxes(1, 2)) / 2
     return States(means, both, cross, states.fade_m, states.turns).turned()

@@ -124,6 +124,7 @@ def _read_free(positions: Sequence[Position], pivots: Sequence[Array]) -> Sighti
     count = len(positions)
     poses, noise = np.zeros((count, 6)), np.zeros((count, 6, 6))
     modes, turns = np.zeros((count, 7, FREE_MODES)), np.empty((count, 3, 3))
+    by_motion = np.zeros((count, 6, 6))
     for row, (position, pivot) in enumerate(zip(positions, pivots, strict=True)):
         assert position.rotation_rad is not None
         turn = rotation(position.rotation_rad)
@@ -139,7 +140,10 @@ def _read_free(positions: Sequence[Position], pivots: Sequence[Array]) -> Sighti
         own = np.zeros((7, 0)) if position.error_modes is None else position.error_modes.reshape(7, -1)
         modes[row, :, : own.shape[1]] = own[:, :FREE_MODES]
         modes[row, :6] = by_pose @ modes[row, :6]
-    return Sightings(poses, noise, modes[:, :6], modes[:, 6], turns)
+        if position.error_by_motion is not None:
+            # The rates are those of the pivot: the body moves around it.
+            by_motion[row] = by_pose @ position.error_by_motion @ np.linalg.inv(by_pose)
+    return Sightings(poses, noise, modes[:, :6], modes[:, 6], turns, by_motion)
 
 
 @dataclass(slots=True, eq=False)

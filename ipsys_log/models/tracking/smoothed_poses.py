@@ -198,22 +198,25 @@ def _filter_block(begin: _State, sightings: Sightings, first: int, forward: Arra
 def _update(before: _State, sightings: Sightings, n: int) -> _State:
     """Return the state after a sighting, in the form of Joseph."""
     mean, covariance, turn = before
-    layout, noise = LEVEL if turn is None else FREE, sightings.noise[n]
-    pose, motion = layout.pose, layout.size
+    layout, noise, seen = LEVEL if turn is None else FREE, sightings.noise[n], sightings.take(np.array([n]))
+    motion = layout.size
     # A camera whose clock is late by d shows the robot v d behind.
     modes = sightings.sensitivities[n] - mean[layout.rates, None] * sightings.clock_s[n]
-    difference = sightings.poses[n] - mean[pose] - modes @ mean[motion:]
+    expected = seen.rows(mean[None, :, None], layout)[0, :, 0]
+    difference = sightings.poses[n] - expected - modes @ mean[motion:]
     if turn is not None and sightings.turns is not None:
+        turned = rotation(expected[_TURN]) @ turn
+        difference[_TURN] = rotation_vector(sightings.turns[n] @ turned.T) - modes[_TURN] @ mean[motion:]
         turn, mean = rotation(mean[_TURN]) @ turn, mean.copy()
         mean[_TURN] = 0.0
-        difference[_TURN] = rotation_vector(sightings.turns[n] @ turn.T) - modes[_TURN] @ mean[motion:]
     else:
         known = noise[_HEADING, _HEADING] < UNKNOWN_RAD2
         difference[_HEADING] = _wrap(difference[_HEADING]) if known else 0.0
-    across = covariance[:, pose] + covariance[:, motion:] @ modes.T
-    gain = np.linalg.solve(across[pose] + modes @ across[motion:] + noise, across.T).T
+    across = seen.columns(covariance[None], layout)[0] + covariance[:, motion:] @ modes.T
+    spread = seen.rows(across[None], layout)[0] + modes @ across[motion:] + noise
+    gain = np.linalg.solve(spread, across.T).T
     left = covariance - gain @ across.T
-    observed = left[:, pose] + left[:, motion:] @ modes.T
+    observed = seen.columns(left[None], layout)[0] + left[:, motion:] @ modes.T
     after = left + (gain @ noise - observed) @ gain.T
     return _State(mean + gain @ difference, (after + after.T) / 2, turn)
 

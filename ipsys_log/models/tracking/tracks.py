@@ -398,15 +398,14 @@ def gather_sightings(records: Sequence[Record | Sighted]) -> Sightings:
         np.array([record.sightings.noise[record.sighting] for record in records]),
         np.array([record.sightings.sensitivities[record.sighting] for record in records]),
         np.array([record.sightings.clock_s[record.sighting] for record in records]),
+        _stacked(one.sightings.turns[one.sighting] for one in records if one.sightings.turns is not None),
         _stacked(
-            record.sightings.turns[record.sighting]
-            for record in records
-            if record.sightings.turns is not None
+            one.sightings.by_rates[one.sighting] for one in records if one.sightings.by_rates is not None
         ),
     )
 
 
-def _stacked(turns: Iterable[Array]) -> Array | None:
-    """Return rotations (3, 3) as one array; None without any, for level robots."""
-    together = list(turns)
+def _stacked(parts: Iterable[Array]) -> Array | None:
+    """Return the matrices of free bodies as one array; None without any, for level robots."""
+    together = list(parts)
     return np.array(together) if together else None

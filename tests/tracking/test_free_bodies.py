@@ -34,13 +34,17 @@ def simulate() -> tuple[list[Sightings], Array, Array]:
     turns = rotate(rng.normal(0, 1.5, (COUNT, 3)))
     (forward,), (spread,) = transition(np.array([STEP_S]), np.zeros(1), NOISE, layout=FREE)
     root = np.linalg.cholesky(spread + 1e-18 * np.eye(FREE.size))
+    # A rolling shutter shows a body elsewhere, by its velocity.
+    by_rates = rng.normal(0, 0.004, (COUNT, 6, 6))
     seen, points_m, rotations = [], [], []
     for _ in range(STEPS):
         errors = amplitudes @ table.T + rng.standard_normal((COUNT, 6)) * SIGMAS
+        errors += (by_rates @ motion[:, 6:12, None])[:, :, 0]
         poses = np.concatenate([motion[:, :3] + errors[:, :3], np.zeros((COUNT, 3))], axis=1)
         noise = np.broadcast_to(np.diag(SIGMAS**2), (COUNT, 6, 6))
         modes = np.broadcast_to(table, (COUNT, 6, MODES))
-        seen.append(Sightings(poses, noise, modes, np.zeros((COUNT, MODES)), rotate(errors[:, 3:]) @ turns))
+        seen_turns = rotate(errors[:, 3:]) @ turns
+        seen.append(Sightings(poses, noise, modes, np.zeros((COUNT, MODES)), seen_turns, by_rates))
         points_m.append(motion[:, :3])
         rotations.append(turns)
         motion = motion @ forward.T + rng.standard_normal((COUNT, FREE.size)) @ root.T
@@ -82,6 +86,7 @@ def test_smoother_of_tumbling_bodies_knows_its_errors() -> None:
             np.concatenate([part.sensitivities for part in parts]),
             np.concatenate([part.clock_s for part in parts]),
             np.concatenate([part.turns for part in parts if part.turns is not None]),
+            np.concatenate([part.by_rates for part in parts if part.by_rates is not None]),
         )
         for block in (7, STEPS):
             (*_, first) = smooth_track(own, np.full(STEPS - 1, STEP_S), NOISE, block=block)

@@ -401,6 +401,7 @@ def test_pivot_of_level_and_of_free_body_is_tracked() -> None:
     assert (Rotation.from_rotvec(eve.rotation_rad).inv() * turned).magnitude() < 1e-9
     # A turn moves the pivot: its point is less certain than that of the body.
     lever = np.cross(np.eye(3), turn.apply(pivot_m))
-    expected = noise[:3, :3] + lever.T @ noise[3:, 3:] @ lever
-    np.testing.assert_allclose(eve.pose_covariance[:3, :3], expected + 1e-8 * np.eye(3), rtol=0.02)
+    by_pose = np.block([[np.eye(3), lever.T], [np.zeros((3, 3)), np.eye(3)]])
+    expected = by_pose @ noise @ by_pose.T + 1e-8 * np.eye(6)
+    np.testing.assert_allclose(eve.pose_covariance, expected, rtol=0.02, atol=1e-9)
     assert made[1].transforms[1].rotation.w == pytest.approx(abs(turned.as_quat()[3]))

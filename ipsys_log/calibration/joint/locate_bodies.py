@@ -63,8 +63,8 @@ class BodyPoses:
         about the axes of the world: rows with other exposures show it at another pose.
     modes : (b, 6, m), errors by the modes of the calibration.
     by_scale : (b, 6), errors by the relative error of the size of the body.
-    chi2, marker_chi2 : (b,) and (b, k), squared residuals in units of the noise: of all corners, with 8 k - 6
-        degrees of freedom, and of each marker.
+    chi2 : (b,), squared residuals in units of the noise and of a usual velocity, with 8 k - 6 degrees of
+        freedom.
     """
 
     points_m: Array
@@ -74,7 +74,6 @@ class BodyPoses:
     modes: Array
     by_scale: Array
     chi2: Array
-    marker_chi2: Array
 
 
 def locate_bodies(model: JointModel, seen: BodySightings) -> BodyPoses:
@@ -199,23 +198,24 @@ class _Rounds:
         return now
 
     def finish(self, points_m: Array, turns: Array) -> BodyPoses:
-        """Return the poses (b, 3), (b, 3, 3) after one more step, with their uncertainties."""
+        """Return the poses (b, 3), (b, 3, 3) after one more step, with their uncertainties.
+
+        The step takes the body for one that stands still, because a filter knows its velocity better.
+        """
         now = _Look(*(part[:, 0] for part in self.look(points_m[:, None], turns[:, None])))
-        across = now.by_pose.swapaxes(1, 2) @ now.weights
-        gains = np.asarray(np.linalg.solve(across @ now.by_pose, across), dtype=np.float64)
+        across = now.by_pose.swapaxes(1, 2) @ np.linalg.inv(self._variances[:, 0])
+        noise = np.asarray(np.linalg.inv(across @ now.by_pose), dtype=np.float64)
+        gains = noise @ across
         change = (gains @ now.residuals[:, :, None])[:, :, 0]
-        left = now.residuals - (now.by_pose @ change[:, :, None])[:, :, 0]
         by_camera = -(gains @ now.by_camera)
-        squares = left * (now.weights @ left[:, :, None])[:, :, 0]
         return BodyPoses(
             points_m - change[:, :3],
             rotate(-change[:, 3:]) @ turns,
-            gains @ self._variances[:, 0] @ gains.swapaxes(1, 2),
+            noise,
             gains @ now.by_twist,
             by_camera @ self._model.modes,
             by_camera[:, :, -1] * self._model.scale,
-            squares.sum(axis=1),
-            squares.reshape(len(left), -1, 8).sum(axis=2),
+            now.chi2,
         )
 
 

@@ -80,7 +80,7 @@ class MotionNoise:
 
 
 # A body that is carried or that flies.
-FREE_MOTION = MotionNoise(1.5, 1.5, 0.3, 6.0, 0.0, 1.0, 1.0, 2.0, 3.0)
+FREE_MOTION = MotionNoise(1.5, 1.5, 0.3, 4.0, 0.0, 1.0, 1.0, 2.0, 3.0)
 
 
 def transition(

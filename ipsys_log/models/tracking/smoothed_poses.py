@@ -200,15 +200,16 @@ def _update(before: _State, sightings: Sightings, n: int) -> _State:
     mean, covariance, turn = before
     layout, noise, seen = LEVEL if turn is None else FREE, sightings.noise[n], sightings.take(np.array([n]))
     motion = layout.size
-    # A camera whose clock is late by d shows the robot v d behind.
-    modes = sightings.sensitivities[n] - mean[layout.rates, None] * sightings.clock_s[n]
-    expected = seen.rows(mean[None, :, None], layout)[0, :, 0]
-    difference = sightings.poses[n] - expected - modes @ mean[motion:]
-    if turn is not None and sightings.turns is not None:
-        turned = rotation(expected[_TURN]) @ turn
-        difference[_TURN] = rotation_vector(sightings.turns[n] @ turned.T) - modes[_TURN] @ mean[motion:]
+    if turn is not None:
         turn, mean = rotation(mean[_TURN]) @ turn, mean.copy()
         mean[_TURN] = 0.0
+    # A camera whose clock is late by d shows the robot v d behind.
+    modes = sightings.sensitivities[n] - mean[layout.rates, None] * sightings.clock_s[n]
+    difference = sightings.poses[n] - seen.rows(mean[None, :, None], layout)[0, :, 0] - modes @ mean[motion:]
+    if turn is not None and sightings.turns is not None:
+        # The turn of the sighting is 0, so the difference is minus the expected turn.
+        turned = rotation(-difference[_TURN]) @ turn
+        difference[_TURN] = rotation_vector(sightings.turns[n] @ turned.T)
     else:
         known = noise[_HEADING, _HEADING] < UNKNOWN_RAD2
         difference[_HEADING] = _wrap(difference[_HEADING]) if known else 0.0

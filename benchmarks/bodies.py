@@ -9,7 +9,8 @@ Three cameras of 1920 x 1080 px with a rolling shutter of 31 us a row, 2.1 m abo
 those of one instant, except for its motion out of its plane. Errors of a corner are normal, with 0.02 or 0.06
 px. The size of the body has the error of ``calibrate-body``, 0.02 %. A lab is one draw: the table has the
 median and the maximum over the labs of the mean and of the 95th percentile. NEES is the mean of the squared
-error in units of its covariance, divided by 6. ``frames`` are poses by one image.
+error in units of its covariance, by degree of freedom. ``frames`` are poses by
+one image.
 """
 
 from __future__ import annotations
@@ -198,7 +199,7 @@ def _rig(lab: GeometricLab, row: BodyRow, scale_sigma: float) -> Rig:
     return Rig("lab", "DICT_4X4_100", 0.2, markers, cameras, bodies=(body,))
 
 
-# Errors (n, 6), covariances (n, 6, 6).
+# Errors (n, 6), and covariances (n, 6, 6), or (n, 3, 3) of the points.
 Errors = tuple[Array, Array]
 
 
@@ -246,26 +247,25 @@ def _errors(rows: Sequence[tuple[int, Any]], flight: Flight, pivot: Array) -> Er
     found_m = np.array([(one.x_m, one.y_m, one.z_m) for _, one in rows]).reshape(-1, 3)
     found = Rotation.from_rotvec(np.array([one.rotation_rad for _, one in rows]).reshape(-1, 3))
     turned_rad = (found * Rotation.from_matrix(turns.reshape(-1, 3, 3)).inv()).as_rotvec()
-    covariances = [_covariance(one) for _, one in rows]
-    return np.concatenate([found_m - true_m, turned_rad], axis=1), np.array(covariances).reshape(-1, 6, 6)
+    return np.concatenate([found_m - true_m, turned_rad], axis=1), np.array(
+        [_covariance(one) for _, one in rows]
+    )
 
 
 def _covariance(one: Track | Position) -> Array:
-    if isinstance(one, Track):
-        assert one.pose_covariance is not None
-        return one.pose_covariance
-    assert one.pose_noise is not None
-    assert one.error_modes is not None
-    assert one.error_by_motion is not None
-    modes, moved = one.error_modes.reshape(7, -1)[:6], one.error_by_motion * np.repeat([0.5, 1.5], 3)
-    return np.asarray(one.pose_noise + modes @ modes.T + moved @ moved.T)
+    """Return the covariance (6, 6) of a track; of a single position (3, 3), because it states no other."""
+    covariance = one.pose_covariance if isinstance(one, Track) else one.covariance_m2
+    assert covariance is not None
+    return covariance
 
 
 def _score(errors: Errors) -> dict[str, float]:
     """Return the figures of one lab."""
     away_mm = 1e3 * np.linalg.norm(errors[0][:, :3], axis=1)
     turned_deg = np.degrees(np.linalg.norm(errors[0][:, 3:], axis=1))
-    solved = np.linalg.solve(errors[1], errors[0][:, :, None])[:, :, 0]
+    size = errors[1].shape[1]
+    stated = errors[0][:, :size]
+    solved = np.linalg.solve(errors[1], stated[:, :, None])[:, :, 0]
     return {
         "poses": len(away_mm),
         "mean mm": float(away_mm.mean()),
@@ -273,7 +273,7 @@ def _score(errors: Errors) -> dict[str, float]:
         "z mm": float(np.median(np.abs(1e3 * errors[0][:, 2]))),
         "mean deg": float(turned_deg.mean()),
         "p95 deg": float(np.percentile(turned_deg, 95)),
-        "NEES": float((errors[0] * solved).sum(axis=1).mean() / 6),
+        "NEES": float((stated * solved).sum(axis=1).mean() / size),
         "over 5 deg": int((turned_deg > 5).sum()),
     }
 

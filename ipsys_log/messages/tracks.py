@@ -5,7 +5,7 @@ The waypoints of robot runs are here, too, with the commands to the wheels that 
 
 from dataclasses import dataclass
 
-from ipsys_log.messages.message import Floats, Mat33, Mat66, TimeNs, Vec3
+from ipsys_log.messages.message import Floats, Mat33, Mat66, TimeNs, Vec3, Vec6
 
 # The states of a controller: it stands at a waypoint while it is holding, and after the last one when it is
 # finished. It is stopped while it gets no positions.
@@ -21,8 +21,8 @@ class Position:
     calibration. ``heading_noise_rad`` is the same part of the heading, as a standard deviation.
 
     The position of a body that is not level is that of its origin, with the id of its first marker. It has
-    the rotation vector ``rotation_rad`` from the axes of the body to those of the world, its ``pose_noise``,
-    ``error_modes`` (7 * n,) and ``error_by_motion``, see ``schemas/ipsys/v1/positions.proto``.
+    the rotation vector ``rotation_rad`` from the axes of the body to those of the world. The other fields are
+    those of a body that stands still, see ``schemas/ipsys/v1/positions.proto``; ``error_modes`` is (7 * n,).
     """
 
     id: int
@@ -36,9 +36,10 @@ class Position:
     noise_m2: Mat33 | None = None
     heading_noise_rad: float | None = None
     rotation_rad: Vec3 | None = None
-    pose_noise: Mat66 | None = None
+    to_still: Vec6 | None = None
+    still_noise: Mat66 | None = None
+    still_by_motion: Mat66 | None = None
     error_modes: Floats | None = None
-    error_by_motion: Mat66 | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

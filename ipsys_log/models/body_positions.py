@@ -9,7 +9,6 @@ import numpy as np
 
 from ipsys_log.calibration.joint.locate import corner_covariances
 from ipsys_log.calibration.joint.locate_bodies import (
-    TWIST_SIGMAS,
     BodyPoses,
     BodySightings,
     locate_bodies,
@@ -156,13 +155,10 @@ class BodyLocator:
         all_modes, turn = poses.modes[row], poses.turns[row]
         kept = all_modes @ self.axes
         others = all_modes @ all_modes.T - kept @ kept.T
-        noise, by_motion = poses.noise[row] + others, poses.by_twist[row]
-        usual = by_motion * TWIST_SIGMAS
+        noise, spread = poses.noise[row] + others, poses.spread[row] + others
         by_scale = poses.by_scale[row][:, None] * shape.scale_sigma
         clock_s = np.append(model.modes[len(model.lens) + 7] @ self.axes, 0.0)
         modes = np.vstack([np.hstack([kept, by_scale]), clock_s])
-        own = noise + usual @ usual.T
-        covariance = own + modes[:6] @ modes[:6].T
         x_m, y_m, z_m = poses.points_m[row].tolist()
         # A turn about the vertical changes the direction of the x axis by as much.
         heading_rad = float(np.arctan2(turn[1, 0], turn[0, 0]))
@@ -172,15 +168,16 @@ class BodyLocator:
             y_m,
             z_m,
             heading_rad,
-            covariance[:3, :3],
+            spread[:3, :3] + modes[:3] @ modes[:3].T,
             fits and model.is_certain and not any(marker.contradicted for marker in seen.markers),
             seen.time_ns - time_ns or None,
-            own[:3, :3],
-            float(np.sqrt(own[5, 5])),
+            spread[:3, :3],
+            float(np.sqrt(spread[5, 5])),
             rotation_vector(turn),
+            poses.to_still[row],
             (noise + noise.T) / 2,
+            poses.by_twist[row],
             modes.ravel(),
-            by_motion,
         )
 
 

@@ -382,9 +382,10 @@ def fly(
             time_s = (stamp_ns + position.time_offset_ns) / 1e9
             true = pose_at(time_s)
             point_m = np.array([position.x_m, position.y_m, position.z_m])
-            turned_rad = rotation_vector(rotation(position.rotation_rad) @ true[:3, :3].T)
-            moved = position.error_by_motion @ twist_at(time_s)
-            errors.append(np.r_[point_m - true[:3, 3], turned_rad] - moved)
+            turn = rotation(position.to_still[3:]) @ rotation(position.rotation_rad)
+            turned_rad = rotation_vector(turn @ true[:3, :3].T)
+            away_m = point_m + position.to_still[:3] - true[:3, 3]
+            errors.append(np.r_[away_m, turned_rad] - position.still_by_motion @ twist_at(time_s))
     assert len(errors) == count
     return events, errors
 

@@ -88,7 +88,7 @@ def test_poses_of_a_rendered_body_have_the_errors_that_they_state() -> None:
     locator.use_rig(rig)
     for payload in (rig, camera.lens):
         assert not list(detect(Message("/first", 0, 0, payload, camera.name)))
-    errors, squares = [], []
+    errors, squares, single_m = [], [], []
     for number in range(FRAMES):
         stamp_s = number / RATE_HZ
         stamp_ns = round(stamp_s * 1e9)
@@ -107,11 +107,18 @@ def test_poses_of_a_rendered_body_have_the_errors_that_they_state() -> None:
         before, true, after = (pose_at(camera, at_s + step_s) for step_s in (-1e-3, 0.0, 1e-3))
         turned_rad = rotation_vector(after[:3, :3] @ before[:3, :3].T)
         twist = np.concatenate([after[:3, 3] - before[:3, 3], turned_rad]) / 2e-3
-        place_m = np.array([position.x_m, position.y_m, position.z_m])
-        wrong_rad = rotation_vector(rotation(position.rotation_rad) @ true[:3, :3].T)
-        wrong = np.concatenate([place_m - true[:3, 3], wrong_rad]) - position.error_by_motion @ twist
+        assert position.to_still is not None
+        assert position.still_by_motion is not None
+        assert position.still_noise is not None
+        single_m.append(np.array([position.x_m, position.y_m, position.z_m]) - true[:3, 3])
+        place_m = single_m[-1] + true[:3, 3] + position.to_still[:3]
+        turn = rotation(position.to_still[3:]) @ rotation(position.rotation_rad)
+        wrong_rad = rotation_vector(turn @ true[:3, :3].T)
+        wrong = np.concatenate([place_m - true[:3, 3], wrong_rad]) - position.still_by_motion @ twist
         errors.append(wrong)
-        squares.append(wrong @ np.linalg.solve(position.pose_noise, wrong) / 6)
+        squares.append(wrong @ np.linalg.solve(position.still_noise, wrong) / 6)
+    # The pose of one frame does not know the velocity.
+    assert np.linalg.norm(single_m[FIRST:], axis=1).mean() < 2e-3
     lengths_m = np.linalg.norm(np.array(errors)[FIRST:, :3], axis=1)
     angles_rad = np.linalg.norm(np.array(errors)[FIRST:, 3:], axis=1)
     assert lengths_m.mean() < 4e-4

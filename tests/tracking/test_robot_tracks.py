@@ -387,7 +387,7 @@ def test_pivot_of_level_and_of_free_body_is_tracked() -> None:
     noise = np.diag(np.repeat([1e-4, 1e-3], 3) ** 2)
     seen = (
         Position(1, 1.0, 2.0, 0.4, 2.5, 1e-8 * np.eye(3), heading_noise_rad=1e-3),
-        Position(2, 1.0, 2.0, 0.4, 0.0, 1e-8 * np.eye(3), rotation_rad=turn.as_rotvec(), pose_noise=noise),
+        Position(2, 1.0, 2.0, 0.4, 0.0, 1e-8 * np.eye(3), rotation_rad=turn.as_rotvec(), still_noise=noise),
     )
     fuse = Fuse("joint")
     list(fuse(Message("/rig", 0, 0, Rig("lab", "DICT_4X4_100", 0.2, markers, bodies=bodies))))

@@ -14,7 +14,7 @@ from ipsys_log.calibration.lens_models import project_points
 from ipsys_log.messages import Array, Mask
 from ipsys_log.vision.lenses import undistort
 from ipsys_log.vision.markers import pixel_slopes
-from ipsys_log.vision.poses import cross, rotate, skew_matrices
+from ipsys_log.vision.poses import cross, rotate, rotation_vectors, skew_matrices
 from ipsys_log.vision.square_pose import fit_squares
 
 # A body is tilted by this standard deviation about each axis: it tells mirrored poses of one marker apart.
@@ -23,10 +23,10 @@ _TILT_RAD = np.radians(20.0)
 TWIST_SIGMAS = np.repeat([0.5, 1.5], 3)
 # Two solutions that differ by less than this converge to the same pose.
 _SAME_RAD = 0.02
-_STEPS = 5
+_STEPS = 4
 _DAMPING = 1e-3
 # The refinement ends when a step promises less than this share of chi2, or than this.
-_SETTLED, _EXACT = 1e-3, 1e-6
+_SETTLED, _EXACT = 1e-2, 1e-6
 _AXES = np.arange(6)
 
 
@@ -57,18 +57,23 @@ class BodyPoses:
     Attributes
     ----------
     points_m, turns : (b, 3) and (b, 3, 3), origins and axes.
-    noise : (b, 6, 6), covariances of the points and of turns about the axes of the world, by the noise of the
-        corners.
-    by_twist : (b, 6, 6), errors by the velocity (m/s) and the angular velocity (rad/s) of the body along and
-        about the axes of the world: rows with other exposures show it at another pose.
-    modes : (b, 6, m), errors by the modes of the calibration.
-    by_scale : (b, 6), errors by the relative error of the size of the body.
+    spread : (b, 6, 6), covariances of the points and of turns about the axes of the world, by the noise of
+        the corners and by a usual velocity: a rolling shutter shows a moving body elsewhere.
+    to_still : (b, 6), from these poses to those of bodies that stand still: motion, and turn. A filter that
+        knows the velocity uses the latter.
+    noise : (b, 6, 6), covariances of the poses of bodies that stand still.
+    by_twist : (b, 6, 6), errors of these poses by the velocity (m/s) and the angular velocity (rad/s) along
+        and about the axes of the world.
+    modes : (b, 6, m), errors of these poses by the modes of the calibration.
+    by_scale : (b, 6), errors of these poses by the relative error of the size of the body.
     chi2 : (b,), squared residuals in units of the noise and of a usual velocity, with 8 k - 6 degrees of
         freedom.
     """
 
     points_m: Array
     turns: Array
+    spread: Array
+    to_still: Array
     noise: Array
     by_twist: Array
     modes: Array
@@ -88,8 +93,8 @@ def locate_bodies(model: JointModel, seen: BodySightings) -> BodyPoses:
     model : the calibrated camera.
     seen : the sightings of b bodies, each with the same number of markers.
     """
-    rounds, row = _Rounds(model, seen), np.arange(len(seen.corners_px))
     points_m, turns = _candidates(model, seen)
+    rounds, row = _Rounds(model, seen, points_m[:, :1], turns[:, :1]), np.arange(len(points_m))
     costs = rounds.look(points_m, turns).chi2 + _tilt_cost(turns)
     first = costs.argmin(axis=1)
     apart = _angles(turns, turns[row, first][:, None])
@@ -101,18 +106,16 @@ def locate_bodies(model: JointModel, seen: BodySightings) -> BodyPoses:
 
 
 class _Look(NamedTuple):
-    """Candidates (b, c, 3), (b, c, 3, 3), their residuals (b, c, 8 k), slopes, weights and chi2 (b, c).
+    """Candidates (b, c, 3), (b, c, 3, 3), their residuals (b, c, 8 k), slopes and chi2 (b, c).
 
-    The slopes (b, c, 8 k, ...) are those by the pose, by the twist and by the unknowns of the camera.
+    ``by_pose`` (b, c, 8 k, 6) and ``by_camera`` (b, c, 8 k, q + 10) are slopes by the pose and by the camera.
     """
 
     points_m: Array
     turns: Array
     residuals: Array
     by_pose: Array
-    by_twist: Array
     by_camera: Array
-    weights: Array
     chi2: Array
 
 
@@ -120,10 +123,10 @@ class _Rounds:
     """The rounds of least squares for the same sightings.
 
     The rows of the corners have different exposures. The unknown velocity of the body makes their errors
-    dependent.
+    dependent: the weights take this from rough poses (b, 1, 3), (b, 1, 3, 3).
     """
 
-    def __init__(self, model: JointModel, seen: BodySightings) -> None:
+    def __init__(self, model: JointModel, seen: BodySightings, points_m: Array, turns: Array) -> None:
         self._model, self._seen = model, seen
         count, markers = seen.corners_px.shape[:2]
         self._inward = edge_motion(seen.corners_px.reshape(-1, 4, 2)).reshape(count, 1, markers, 4, 2)
@@ -132,9 +135,13 @@ class _Rounds:
         own = seen.covariances_px2 + model.corner_floor_px**2 * np.eye(8)
         variances[:, number, :, number] = own.swapaxes(0, 1)
         self._variances = variances.reshape(count, 1, markers * 8, markers * 8)
+        self._weights = np.zeros_like(self._variances)
+        usual = self._by_twist(self.look(points_m, turns)) * TWIST_SIGMAS
+        spread = self._variances + usual @ usual.swapaxes(-1, -2)
+        self._weights = np.asarray(np.linalg.inv(spread), dtype=np.float64)
 
     def look(self, points_m: Array, turns: Array) -> _Look:
-        """Return the residuals, slopes and weights of candidates (b, c, 3), (b, c, 3, 3)."""
+        """Return the residuals and slopes of candidates (b, c, 3), (b, c, 3, 3)."""
         count, candidates = points_m.shape[:2]
         markers = self._seen.corners_px.shape[1]
         many = count, candidates, markers
@@ -149,13 +156,14 @@ class _Rounds:
         residuals, by_pose, by_camera = (
             part.reshape(count, candidates, markers * 8, *part.shape[2:]) for part in now
         )
-        by_corner = by_pose[..., :3].reshape(*many, 4, 2, 3)
-        by_twist = (by_corner @ self._motion(arms_m)).reshape(by_pose.shape)
-        usual = by_twist * TWIST_SIGMAS
-        variances = self._variances + usual @ usual.swapaxes(-1, -2)
-        weights = np.asarray(np.linalg.inv(variances), dtype=np.float64)
-        chi2 = (residuals * (weights @ residuals[..., None])[..., 0]).sum(axis=-1)
-        return _Look(points_m, turns, residuals, by_pose, by_twist, by_camera, weights, chi2)
+        chi2 = (residuals * (self._weights @ residuals[..., None])[..., 0]).sum(axis=-1)
+        return _Look(points_m, turns, residuals, by_pose, by_camera, chi2)
+
+    def _by_twist(self, now: _Look) -> Array:
+        """Return the slopes (b, c, 8 k, 6) of the corners by the twist of the body."""
+        arms_m = self._seen.corners_m[:, None] @ now.turns[:, :, None].swapaxes(-1, -2)
+        by_corner = now.by_pose[..., :3].reshape(*arms_m.shape[:-1], 2, 3)
+        return np.asarray((by_corner @ self._motion(arms_m)).reshape(now.by_pose.shape))
 
     def _motion(self, arms_m: Array) -> Array:
         """Return the motion of corners (b, c, k, 4, 3, 6) by the twist, until their exposures.
@@ -183,7 +191,7 @@ class _Rounds:
         now = self.look(points_m, turns)
         damping = np.full(now.chi2.shape, _DAMPING)
         for _ in range(_STEPS):
-            across = now.by_pose.swapaxes(-1, -2) @ now.weights
+            across = now.by_pose.swapaxes(-1, -2) @ self._weights
             normal, gradient = across @ now.by_pose, across @ now.residuals[..., None]
             normal[..., _AXES, _AXES] *= 1 + damping[..., None]
             step = np.asarray(np.linalg.solve(normal, gradient), dtype=np.float64)
@@ -198,25 +206,34 @@ class _Rounds:
         return now
 
     def finish(self, points_m: Array, turns: Array) -> BodyPoses:
-        """Return the poses (b, 3), (b, 3, 3) after one more step, with their uncertainties.
-
-        The step takes the body for one that stands still, because a filter knows its velocity better.
-        """
-        now = _Look(*(part[:, 0] for part in self.look(points_m[:, None], turns[:, None])))
-        across = now.by_pose.swapaxes(1, 2) @ np.linalg.inv(self._variances[:, 0])
-        noise = np.asarray(np.linalg.inv(across @ now.by_pose), dtype=np.float64)
-        gains = noise @ across
-        change = (gains @ now.residuals[:, :, None])[:, :, 0]
+        """Return the poses (b, 3), (b, 3, 3) after one more step, with their uncertainties."""
+        looked = self.look(points_m[:, None], turns[:, None])
+        by_twist, now = self._by_twist(looked)[:, 0], _Look(*(part[:, 0] for part in looked))
+        usual, variances = by_twist * TWIST_SIGMAS, self._variances[:, 0]
+        moving, spread, _ = _step(now, variances + usual @ usual.swapaxes(1, 2))
+        still, noise, gains = _step(now, variances)
+        turned, standing = (rotate(-change[:, 3:]) @ turns for change in (moving, still))
+        to_still = rotation_vectors(standing @ turned.swapaxes(1, 2))
         by_camera = -(gains @ now.by_camera)
         return BodyPoses(
-            points_m - change[:, :3],
-            rotate(-change[:, 3:]) @ turns,
+            points_m - moving[:, :3],
+            turned,
+            spread,
+            np.concatenate([moving[:, :3] - still[:, :3], to_still], axis=1),
             noise,
-            gains @ now.by_twist,
+            gains @ by_twist,
             by_camera @ self._model.modes,
             by_camera[:, :, -1] * self._model.scale,
             now.chi2,
         )
+
+
+def _step(now: _Look, variances: Array) -> tuple[Array, Array, Array]:
+    """Return changes (b, 6), covariances and gains (b, 6, 8 k), by variances (b, 8 k, 8 k) of the corners."""
+    across = now.by_pose.swapaxes(1, 2) @ np.linalg.inv(variances)
+    covariances = np.asarray(np.linalg.inv(across @ now.by_pose), dtype=np.float64)
+    gains = covariances @ across
+    return (gains @ now.residuals[:, :, None])[:, :, 0], covariances, gains
 
 
 def _skew(vectors: Array) -> Array:
@@ -290,8 +307,11 @@ def strongest_modes(models: Iterable[JointModel], corners_m: Array, count: int) 
         rays = rays[np.isfinite(rays).all(axis=1) & (rays[:, 2] < 0)]
         depths_m = -np.array(_DEPTH_SHARES)[:, None] * model.origin_m[2] / rays[:, 2]
         points_m = (model.origin_m + depths_m[:, :, None] * rays).reshape(-1, 3)
-        rounds = _Rounds(model, level_sightings(model, points_m, corners_m))
-        poses = rounds.finish(points_m, np.broadcast_to(np.eye(3), (len(points_m), 3, 3)))
+        level = np.broadcast_to(np.eye(3), (len(points_m), 3, 3))
+        rounds = _Rounds(
+            model, level_sightings(model, points_m, corners_m), points_m[:, None], level[:, None]
+        )
+        poses = rounds.finish(points_m, level)
         seen = np.isfinite(poses.modes).all(axis=(1, 2))
         effects.append(poses.modes[seen] * np.repeat([1.0, _ARM_M], 3)[:, None])
     rows = np.concatenate(effects).reshape(-1, effects[0].shape[2])

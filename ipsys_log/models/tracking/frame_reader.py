@@ -29,6 +29,8 @@ _UNKNOWN_M, _UNKNOWN_RAD = 0.005, 0.05
 FREE_MODES = 21
 # No lab is larger, and no heading has a larger error.
 _FARTHEST_M, _LARGEST_RAD = 1e6, 10.0
+_UNKNOWN_POSE = np.diag(np.repeat([_UNKNOWN_M, _UNKNOWN_RAD], 3) ** 2)
+_LEAST_POSE = np.diag(np.repeat([_LEAST_M, _LEAST_RAD], 3) ** 2)
 _PLACE, _UNKNOWN = np.arange(3), np.full((3, 3), np.nan)
 _LEAST_EYE_M2, _USUAL_EYE_M2, _UNKNOWN_EYE_M2 = (
     sigma_m**2 * np.eye(3) for sigma_m in (_LEAST_M, _USUAL_M, _UNKNOWN_M)
@@ -95,7 +97,7 @@ class FrameReader:
         if free:
             robots = [self._robots.get(p.id) or self._robot_of(p.id) for p in free]
             pivots = [self._shapes[p.id].body_from_pivot if p.id in self._shapes else np.eye(4) for p in free]
-            known = [position.pose_noise is not None for position in free]
+            known = [position.still_noise is not None for position in free]
             yield _frame(camera, time_ns, free, robots, _read_free(free, pivots), known)
 
     def _robot_of(self, marker_id: int) -> Robot:
@@ -127,22 +129,22 @@ def _read_free(positions: Sequence[Position], pivots: Sequence[Array]) -> Sighti
     by_motion = np.zeros((count, 6, 6))
     for row, (position, pivot) in enumerate(zip(positions, pivots, strict=True)):
         assert position.rotation_rad is not None
-        turn = rotation(position.rotation_rad)
+        to_still = np.zeros(6) if position.to_still is None else position.to_still
+        turn = rotation(to_still[3:]) @ rotation(position.rotation_rad)
         arm_m = turn @ pivot[:3, 3]
-        poses[row, :3] = np.array([position.x_m, position.y_m, position.z_m]) + arm_m
+        poses[row, :3] = np.array([position.x_m, position.y_m, position.z_m]) + to_still[:3] + arm_m
         turns[row] = turn @ pivot[:3, :3]
         # A turn of the body moves the pivot around its origin.
         by_pose = np.eye(6)
         by_pose[:3, 3:] = -skew_matrices(arm_m[None])[0]
-        unknown = np.diag(np.repeat([_UNKNOWN_M, _UNKNOWN_RAD], 3) ** 2)
-        own = unknown if position.pose_noise is None else position.pose_noise
-        noise[row] = by_pose @ own @ by_pose.T + np.diag(np.repeat([_LEAST_M, _LEAST_RAD], 3) ** 2)
+        own = _UNKNOWN_POSE if position.still_noise is None else position.still_noise
+        noise[row] = by_pose @ own @ by_pose.T + _LEAST_POSE
         own = np.zeros((7, 0)) if position.error_modes is None else position.error_modes.reshape(7, -1)
         modes[row, :, : own.shape[1]] = own[:, :FREE_MODES]
         modes[row, :6] = by_pose @ modes[row, :6]
-        if position.error_by_motion is not None:
+        if position.still_by_motion is not None:
             # The rates are those of the pivot: the body moves around it.
-            by_motion[row] = by_pose @ position.error_by_motion @ np.linalg.inv(by_pose)
+            by_motion[row] = by_pose @ position.still_by_motion @ np.linalg.inv(by_pose)
     return Sightings(poses, noise, modes[:, :6], modes[:, 6], turns, by_motion)
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from track_drives import SeenDrive
 
 from ipsys_log.messages import Message, Position, Track, Tracks
-from ipsys_log.models.tracking.filter import MotionNoise
+from ipsys_log.models.tracking.motion import MotionNoise
 from ipsys_log.models.tracking.smoothed_poses import Frame, smooth_positions
 from ipsys_log.models.tracking.track_messages import TrackRows, gather_rows, interpolate, make_track
 from ipsys_log.stages.fuse import Fuse

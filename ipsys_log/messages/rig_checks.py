@@ -1,11 +1,15 @@
-"""Checks of a rig file: values in a wrong unit, and marker ids that do not exist."""
+"""Checks of a rig: values in a wrong unit, marker ids that do not exist, and bodies."""
 
+import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.messages import Rig
+from ipsys_log.messages import Rig, RigBody, RigMarker
+
+LARGEST_SCALE_SIGMA = 0.05  # of a tape: a stick that somebody made; of a body: a print of another size
+_LARGEST_BODY_M = 5.0  # from the centre of a marker to another one, or to the pivot
 
 
 class _Kind(NamedTuple):
@@ -111,3 +115,58 @@ def _given(rig: Rig) -> Iterator[tuple[str, str, float]]:
             value = getattr(item, key, None)
             if value is not None and not (key == "row_time_ns" and value == 0):
                 yield name, key, value
+
+
+def check_bodies(rig: Rig, where: str) -> None:
+    """Check that each robot with several markers is a body, and that bodies have markers with poses."""
+    check_unique((body.robot for body in rig.bodies), f"{where}: two bodies have the robot")
+    markers: dict[str, list[RigMarker]] = {}
+    for marker in rig.markers:
+        if marker.robot is not None:
+            markers.setdefault(marker.robot, []).append(marker)
+    bodies = {body.robot for body in rig.bodies}
+    for robot, own in markers.items():
+        if len(own) > 1 and robot not in bodies:
+            raise IpsysError(
+                f"{where}: robot {robot!r} has several markers; add [[bodies]] with this robot, and with "
+                "level = true if it stays level"
+            )
+        check_unique(
+            (marker.xyz_m for marker in own if marker.xyz_m), f"{where}: two markers of {robot} are at"
+        )
+    for body in rig.bodies:
+        if body.scale_sigma is not None and not 0 < body.scale_sigma <= LARGEST_SCALE_SIGMA:
+            raise IpsysError(
+                f"{where}: scale_sigma of {body.robot} is {body.scale_sigma:g}; write 0.001 for 0.1 %"
+            )
+        if body.robot not in markers:
+            raise IpsysError(
+                f"{where}: no marker has the robot {body.robot!r} of [[bodies]]; name it in [[markers]]"
+            )
+        unknown = [m.id for m in markers[body.robot] if body.level and rig.height_of(m.id) is None]
+        if unknown:
+            raise IpsysError(
+                f"{where}: {body.robot} is level, but its marker {unknown[0]} has no height_m; write it, or "
+                "level = false"
+            )
+        _check_triples(body, ("pivot_m", "pivot_rpy_rad"), f"{where}: {{}} of {body.robot}")
+    for marker in rig.markers:
+        _check_triples(marker, ("xyz_m", "rpy_rad"), f"{where}: {{}} of marker {marker.id}")
+
+
+def _check_triples(item: RigMarker | RigBody, keys: Iterable[str], where: str) -> None:
+    for key in keys:
+        numbers, name = getattr(item, key), where.format(key)
+        if numbers and (len(numbers) != 3 or not all(map(math.isfinite, numbers))):
+            raise IpsysError(f"{name} needs three numbers, such as [0.1, 0.0, 0.05]")
+        most, unit = (2 * math.pi, "rad") if key.endswith("rad") else (_LARGEST_BODY_M, "m")
+        if numbers and max(map(abs, numbers)) > most:
+            raise IpsysError(f"{name} is {list(numbers)}; give {unit}, at most {most:.3g}")
+
+
+def check_unique(names: Iterable[object], what: str) -> None:
+    seen: set[object] = set()
+    for name in names:
+        if name in seen:
+            raise IpsysError(f"{what} {name!r}; give each its own")
+        seen.add(name)

@@ -4,7 +4,7 @@ import json
 import math
 import re
 import tomllib
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import MISSING, fields, replace
 from difflib import get_close_matches
 from importlib.resources import files
@@ -23,20 +23,18 @@ from ipsys_log.messages import (
     RigNodes,
     RigStream,
 )
-from ipsys_log.messages.rig_checks import check_units
+from ipsys_log.messages.rig_checks import LARGEST_SCALE_SIGMA, check_bodies, check_unique, check_units
 from ipsys_log.plain_text import hide_password, shell_words
 
 Item = TypeVar("Item")
 
 # Markers are below the cameras. A greater height is in cm.
 _HIGHEST_M = 5.0
-_LARGEST_BODY_M = 5.0  # from the centre of a marker to another one, or to the pivot
 _FARTHEST = 1e6  # m, px, s or Hz: no number of a lab is larger
 _LARGEST_INT = {"_ns": 2**62}  # by the last three characters of a name
 _LARGEST_ID = 2**31 - 1
 _LARGEST_FILE = 1 << 18  # bytes
 _LARGEST_PORT = 65535
-_LARGEST_SCALE_SIGMA = 0.05  # of a tape: a stick that somebody made
 _MARKER = re.compile(r"marker_\d{1,4}")
 _LONGEST_LINE = 120  # characters of a line that an error repeats
 
@@ -237,11 +235,11 @@ def check_rig(rig: Rig, where: str) -> Rig:
     for marker in rig.markers:
         if marker.robot is not None:
             check_name(marker.robot, f"{where}: robot name")
-    _check_unique((camera.name for camera in rig.cameras), f"{where}: two cameras have the name")
+    check_unique((camera.name for camera in rig.cameras), f"{where}: two cameras have the name")
     ids = (marker.id for marker in rig.all_markers)
-    _check_unique(ids, f"{where}: two markers have the id")
-    _check_bodies(rig, where)
-    _check_unique((p.name for p in rig.reference_points), f"{where}: two reference points have the name")
+    check_unique(ids, f"{where}: two markers have the id")
+    check_bodies(rig, where)
+    check_unique((p.name for p in rig.reference_points), f"{where}: two reference points have the name")
     markers = rig.all_markers
     lengths = [rig.marker_length_m, *(m.length_m for m in markers if m.length_m is not None)]
     if rig.floor is not None:
@@ -257,53 +255,6 @@ def check_rig(rig: Rig, where: str) -> Rig:
     for item in (rig, rig.floor, *markers, *rig.cameras, *rig.reference_points):
         _check_numbers(item, where)
     return rig
-
-
-def _check_bodies(rig: Rig, where: str) -> None:
-    """Check that each robot with several markers is a body, and that bodies have markers with poses."""
-    _check_unique((body.robot for body in rig.bodies), f"{where}: two bodies have the robot")
-    markers: dict[str, list[RigMarker]] = {}
-    for marker in rig.markers:
-        if marker.robot is not None:
-            markers.setdefault(marker.robot, []).append(marker)
-    bodies = {body.robot for body in rig.bodies}
-    for robot, own in markers.items():
-        if len(own) > 1 and robot not in bodies:
-            raise IpsysError(
-                f"{where}: robot {robot!r} has several markers; add [[bodies]] with this robot, and with "
-                "level = true if it stays level"
-            )
-        _check_unique(
-            (marker.xyz_m for marker in own if marker.xyz_m), f"{where}: two markers of {robot} are at"
-        )
-    for body in rig.bodies:
-        if body.scale_sigma is not None and not 0 < body.scale_sigma <= _LARGEST_SCALE_SIGMA:
-            raise IpsysError(
-                f"{where}: scale_sigma of {body.robot} is {body.scale_sigma:g}; write 0.001 for 0.1 %"
-            )
-        if body.robot not in markers:
-            raise IpsysError(
-                f"{where}: no marker has the robot {body.robot!r} of [[bodies]]; name it in [[markers]]"
-            )
-        unknown = [m.id for m in markers[body.robot] if body.level and rig.height_of(m.id) is None]
-        if unknown:
-            raise IpsysError(
-                f"{where}: {body.robot} is level, but its marker {unknown[0]} has no height_m; write it, or "
-                "level = false"
-            )
-        _check_triples(body, ("pivot_m", "pivot_rpy_rad"), f"{where}: {{}} of {body.robot}")
-    for marker in rig.markers:
-        _check_triples(marker, ("xyz_m", "rpy_rad"), f"{where}: {{}} of marker {marker.id}")
-
-
-def _check_triples(item: RigMarker | RigBody, keys: Iterable[str], where: str) -> None:
-    for key in keys:
-        numbers, name = getattr(item, key), where.format(key)
-        if numbers and (len(numbers) != 3 or not all(map(math.isfinite, numbers))):
-            raise IpsysError(f"{name} needs three numbers, such as [0.1, 0.0, 0.05]")
-        most, unit = (2 * math.pi, "rad") if key.endswith("rad") else (_LARGEST_BODY_M, "m")
-        if numbers and max(map(abs, numbers)) > most:
-            raise IpsysError(f"{name} is {list(numbers)}; give {unit}, at most {most:.3g}")
 
 
 def _check_numbers(item: Any, where: str) -> None:
@@ -326,7 +277,7 @@ def _check_cameras(rig: Rig, where: str) -> None:
                 + " or ".join(f'"{name}"' for name in STAMPS)
             )
     sources = (hide_password(camera.source) for camera in rig.cameras if camera.source)
-    _check_unique(sources, f"{where}: two cameras have the source")
+    check_unique(sources, f"{where}: two cameras have the source")
 
 
 def _check_tape(rig: Rig, where: str) -> None:
@@ -338,7 +289,7 @@ def _check_tape(rig: Rig, where: str) -> None:
             )
     # Positions are rounded to 1 mm: two nearer points are probably one point that is in the file twice.
     at_m = ((round(point.x_m, 3), round(point.y_m, 3)) for point in rig.reference_points)
-    _check_unique(at_m, f"{where}: two reference points are at")
+    check_unique(at_m, f"{where}: two reference points are at")
     sigmas_m = {"tape_sigma_m": rig.tape_sigma_m, "marker_height_sigma_m": rig.marker_height_sigma_m}
     sigmas_m |= {"ab_sigma_m": rig.ab_sigma_m}
     sigmas_m |= {f"height_sigma_m of marker {marker.id}": marker.height_sigma_m for marker in rig.markers}
@@ -347,10 +298,10 @@ def _check_tape(rig: Rig, where: str) -> None:
             raise IpsysError(f"{where}: {key} = {sigma_m} m is not a standard deviation; it must be above 0")
 
     scale_sigma = rig.tape_scale_sigma
-    if scale_sigma is not None and not 0 < scale_sigma <= _LARGEST_SCALE_SIGMA:
+    if scale_sigma is not None and not 0 < scale_sigma <= LARGEST_SCALE_SIGMA:
         raise IpsysError(
             f"{where}: tape_scale_sigma = {scale_sigma} is not a relative standard deviation from 0 to "
-            f"{_LARGEST_SCALE_SIGMA:g}; write 0.001 for 0.1 %"
+            f"{LARGEST_SCALE_SIGMA:g}; write 0.001 for 0.1 %"
         )
 
 
@@ -393,14 +344,6 @@ def check_robots(rig: Rig, robots: Collection[str], where: str) -> None:
                 f"the rig has {', '.join(sorted(known))}" if known else "the rig names none: use marker_<id>"
             )
             raise IpsysError(f"{where}: robot {robot!r} is not known; {named}")
-
-
-def _check_unique(names: Iterable[object], what: str) -> None:
-    seen: set[object] = set()
-    for name in names:
-        if name in seen:
-            raise IpsysError(f"{what} {name!r}; give each its own")
-        seen.add(name)
 
 
 def _build(item: type[Item], row: Any, where: str) -> Item:

@@ -8,18 +8,8 @@ from numpy.typing import NDArray
 from scipy.integrate import quad_vec
 from scipy.linalg import expm
 
-from ipsys_log.models.tracking.filter import (
-    LEVEL,
-    UNKNOWN_RAD2,
-    MotionNoise,
-    Sightings,
-    States,
-    compare,
-    predict,
-    start,
-    transition,
-    update,
-)
+from ipsys_log.models.tracking.filter import UNKNOWN_RAD2, Sightings, States, compare, predict, start, update
+from ipsys_log.models.tracking.motion import LEVEL, MotionNoise, transition
 
 Array = NDArray[np.float64]
 

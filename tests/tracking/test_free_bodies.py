@@ -4,17 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ipsys_log.models.tracking.filter import (
-    FREE,
-    MotionNoise,
-    Sightings,
-    States,
-    compare,
-    predict,
-    start,
-    transition,
-    update,
-)
+from ipsys_log.models.tracking.filter import Sightings, States, compare, predict, start, update
+from ipsys_log.models.tracking.motion import FREE, MotionNoise, transition
 from ipsys_log.models.tracking.smoothed_poses import smooth_track
 from ipsys_log.vision.poses import rotate, rotation_vectors
 from tests.joint.small_lab import Array

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from ipsys_log.messages import Message, Track, Tracks
-from ipsys_log.models.tracking.filter import MotionNoise
+from ipsys_log.models.tracking.motion import MotionNoise
 from ipsys_log.models.tracking.track_messages import TrackRows, gather_rows, interpolate
 
 Array = NDArray[np.float64]

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ipsys_log.models.tracking.filter import LEVEL, MotionNoise, Sightings, States, start, transition
+from ipsys_log.models.tracking.filter import Sightings, States, start
+from ipsys_log.models.tracking.motion import LEVEL, MotionNoise, transition
 from ipsys_log.models.tracking.smoothed_poses import smooth_track
 
 Array = NDArray[np.float64]

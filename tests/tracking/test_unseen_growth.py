@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ipsys_log.models.tracking.filter import LEVEL, MotionNoise, displacement, transition
+from ipsys_log.models.tracking.motion import LEVEL, MotionNoise, displacement, transition
 from ipsys_log.models.tracking.tracks import RobotTracks, TrackSettings
 from ipsys_log.units import NS_PER_S
 from tests.tracking.driving import MS, NOISE_M, NOISE_RAD, START_NS, arrays, follow, sight

@@ -1,12 +1,17 @@
 """The recent sightings of one robot in order of time, and the growth of its covariance without them."""
 
 from bisect import bisect_left, bisect_right
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from math import hypot
 from typing import NamedTuple
 
-from ipsys_log.models.tracking.filter import MotionNoise, Sightings, States, displacement
+import numpy as np
+
+from ipsys_log.messages import Array
+from ipsys_log.models.tracking.filter import Sightings, States
+from ipsys_log.models.tracking.motion import MotionNoise, displacement
 from ipsys_log.units import NS_PER_S
 
 # A sighting that is older than the newest one by more than this is left out.
@@ -135,6 +140,40 @@ def combine_seen(seen: tuple[Seen, ...]) -> tuple[tuple[str, ...], bool | None]:
     """Return the cameras of sightings, sorted, and whether one of them is inside; None if no camera tells."""
     flags = [inside for _, inside in seen if inside is not None]
     return tuple(sorted({camera for camera, _ in seen})), any(flags) if flags else None
+
+
+def gather_states(records: Sequence[Record]) -> States:
+    """Return the states of records of different messages together."""
+    states = records[0].states
+    if all(record.states is states for record in records):
+        return states.take(np.array([record.state for record in records]))
+    return States(
+        np.array([record.states.means[record.state] for record in records]),
+        np.array([record.states.covariances[record.state] for record in records]),
+        np.array([record.states.cross[record.state] for record in records]),
+        states.fade_m,
+        _stacked(record.states.turns[record.state] for record in records if record.states.turns is not None),
+    )
+
+
+def gather_sightings(records: Sequence[Record | Sighted]) -> Sightings:
+    """Return the sightings of records of different messages together."""
+    return Sightings(
+        np.array([record.sightings.poses[record.sighting] for record in records]),
+        np.array([record.sightings.noise[record.sighting] for record in records]),
+        np.array([record.sightings.sensitivities[record.sighting] for record in records]),
+        np.array([record.sightings.clock_s[record.sighting] for record in records]),
+        _stacked(one.sightings.turns[one.sighting] for one in records if one.sightings.turns is not None),
+        _stacked(
+            one.sightings.by_rates[one.sighting] for one in records if one.sightings.by_rates is not None
+        ),
+    )
+
+
+def _stacked(parts: Iterable[Array]) -> Array | None:
+    """Return the matrices of free bodies as one array; None without any, for level robots."""
+    together = list(parts)
+    return np.array(together) if together else None
 
 
 # A prediction of this duration is compared

@@ -14,26 +14,16 @@ from typing import NamedTuple
 import numpy as np
 
 from ipsys_log.messages import Array, Model, Position, Rig
-from ipsys_log.models.tracking.filter import (
-    FREE,
-    LEVEL,
-    UNKNOWN_RAD2,
-    Layout,
-    MotionNoise,
-    Sightings,
-    States,
-    start,
-    transition,
-)
+from ipsys_log.models.tracking.filter import UNKNOWN_RAD2, Sightings, States, start
 from ipsys_log.models.tracking.frame_reader import FrameReader
-from ipsys_log.models.tracking.history import Sighted, combine_seen
+from ipsys_log.models.tracking.history import Sighted, combine_seen, gather_sightings
+from ipsys_log.models.tracking.motion import FREE, LEVEL, Layout, MotionNoise, transition
 from ipsys_log.models.tracking.tracks import (
     FREE_BODIES,
     Pose,
     Robot,
     RobotTracks,
     TrackSettings,
-    gather_sightings,
 )
 from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.poses import rotation, rotation_vector

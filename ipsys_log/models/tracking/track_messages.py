@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ipsys_log.messages import STAMP_UNRELIABLE, Array, Event, Indices, Message, Model, Rig, Times, Track
 from ipsys_log.messages.channels import EVENTS, MODEL, POSITIONS, RIG, Channel
 from ipsys_log.messages.stage import StageView
-from ipsys_log.models.tracking.filter import MotionNoise, transition
+from ipsys_log.models.tracking.motion import MotionNoise, transition
 from ipsys_log.models.tracking.tracks import Pose
 from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.bodies import rpy_from_rotation

@@ -1,6 +1,6 @@
 """Tracks of robots from the sightings of all cameras, in the order in which they arrive."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -8,18 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.messages import Array
-from ipsys_log.models.tracking.filter import (
-    FREE_MOTION,
-    Innovations,
-    MotionNoise,
-    Sightings,
-    States,
-    compare,
-    predict,
-    start,
-    update,
+from ipsys_log.models.tracking.filter import Innovations, Sightings, States, compare, predict, start, update
+from ipsys_log.models.tracking.history import (
+    HISTORY_NS,
+    History,
+    Record,
+    UnseenGrowth,
+    gather_sightings,
+    gather_states,
 )
-from ipsys_log.models.tracking.history import HISTORY_NS, History, Record, Sighted, UnseenGrowth
+from ipsys_log.models.tracking.motion import FREE_MOTION, MotionNoise
 from ipsys_log.units import NS_PER_S
 
 # The name of a robot, and the id of its reference marker.
@@ -196,7 +194,7 @@ class RobotTracks:
                 coasting.append((robot, track, age_ns))
         if not coasting:
             return []
-        last = _gather([track.history.newest for _, track, _ in coasting])
+        last = gather_states([track.history.newest for _, track, _ in coasting])
         ages_s = np.array([age_ns for _, _, age_ns in coasting]) / NS_PER_S
         scales = np.array([track.growth.scale for _, track, _ in coasting])
         states = predict(last, ages_s, settings.motion, scales)
@@ -330,7 +328,7 @@ class RobotTracks:
 
     def _predicted(self, before: Sequence[Record], times_ns: Sequence[int]) -> States:
         durations_s = np.array([t - r.time_ns for t, r in zip(times_ns, before, strict=True)]) / NS_PER_S
-        return predict(_gather(before), durations_s, self._settings.motion)
+        return predict(gather_states(before), durations_s, self._settings.motion)
 
     def _agrees(self, innovations: Innovations) -> NDArray[np.bool_]:
         """Return a mask (k,) of the sightings within the gate."""
@@ -375,37 +373,3 @@ class RobotTracks:
             batch.has_covariance[row],
             age_ns=time_ns - track.history.began_ns,
         )
-
-
-def _gather(records: Sequence[Record]) -> States:
-    """Return the states of records of different messages together."""
-    states = records[0].states
-    if all(record.states is states for record in records):
-        return states.take(np.array([record.state for record in records]))
-    return States(
-        np.array([record.states.means[record.state] for record in records]),
-        np.array([record.states.covariances[record.state] for record in records]),
-        np.array([record.states.cross[record.state] for record in records]),
-        states.fade_m,
-        _stacked(record.states.turns[record.state] for record in records if record.states.turns is not None),
-    )
-
-
-def gather_sightings(records: Sequence[Record | Sighted]) -> Sightings:
-    """Return the sightings of records of different messages together."""
-    return Sightings(
-        np.array([record.sightings.poses[record.sighting] for record in records]),
-        np.array([record.sightings.noise[record.sighting] for record in records]),
-        np.array([record.sightings.sensitivities[record.sighting] for record in records]),
-        np.array([record.sightings.clock_s[record.sighting] for record in records]),
-        _stacked(one.sightings.turns[one.sighting] for one in records if one.sightings.turns is not None),
-        _stacked(
-            one.sightings.by_rates[one.sighting] for one in records if one.sightings.by_rates is not None
-        ),
-    )
-
-
-def _stacked(parts: Iterable[Array]) -> Array | None:
-    """Return the matrices of free bodies as one array; None without any, for level robots."""
-    together = list(parts)
-    return np.array(together) if together else None

@@ -19,13 +19,14 @@ import argparse
 import json
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from geometric_labs import Scene, fit_session, make_session
+from honest_labs import scale_tape
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 from threadpoolctl import threadpool_limits
@@ -81,10 +82,12 @@ class BodyRow:
     points: int = 75
     print_error: float | None = None
     overlap: bool = False
+    exact_tape: bool = False
 
 
 ROWS = (
     BodyRow("four markers"),
+    BodyRow("four markers, exact tape", exact_tape=True),
     BodyRow("four markers, 0.06 px", sigma_px=0.06),
     BodyRow("four markers, a drive and 4 points", points=4),
     BodyRow("one marker", markers=1),
@@ -94,8 +97,8 @@ ROWS = (
 
 
 @cache
-def calibrate(points: int, seed: int) -> tuple[GeometricLab, Model]:
-    """Return a lab and its joint calibration; the prints differ by 0.1 %."""
+def calibrate(points: int, seed: int, exact_tape: bool) -> tuple[GeometricLab, Model]:
+    """Return a lab and its joint calibration; the scale of the tape and the prints are drawn with 0.1 %."""
     drives = points < 75
     settings = GeometricSettings(
         lab=LabSettings(
@@ -106,6 +109,9 @@ def calibrate(points: int, seed: int) -> tuple[GeometricLab, Model]:
         marker_scale_sigma=0.001,
     )
     session = make_session(Scene("bodies", settings), seed)
+    if not exact_tape:
+        scale = 1 + np.random.default_rng([seed, 33]).normal(0.0, 0.001)
+        session = replace(session, messages=tuple(scale_tape(iter(session.messages), scale)))
     return session.lab, joint_payload(fit_session(session), session.pairs, 0)
 
 
@@ -205,7 +211,7 @@ Errors = tuple[Array, Array]
 
 def fly(row: BodyRow, seed: int, duration_s: float) -> dict[str, Errors]:
     """Return the errors of the poses of a lab: of single frames, of tracks, and of smoothed tracks."""
-    lab, model = calibrate(row.points, seed)
+    lab, model = calibrate(row.points, seed, row.exact_tape)
     rng = np.random.default_rng(seed)
     sigma = 0.0002 if row.print_error is None else abs(row.print_error)
     scale = 1 + (rng.normal(0, sigma) if row.print_error is None else row.print_error)

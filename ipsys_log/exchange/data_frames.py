@@ -64,6 +64,9 @@ _MOTION = (
     "age_ns",
 )
 _TRACK = ("robot", *_POINT, "cameras", "inside", *_MOTION)
+# Fields of tracks of bodies that are not level.
+_TURN = ("rotation_rad", "pose_covariance", "angular_velocity_rad_s")
+_ANGLES = ("rx", "ry", "rz")
 
 
 _Expand = Callable[[str, Column], dict[str, Any]]
@@ -128,13 +131,16 @@ def read_table(
     return joined
 
 
-def read_table_parts(session: Session, name: str, run: str | None) -> Iterator[pd.DataFrame]:
+def read_table_parts(
+    session: Session, name: str, run: str | None, with_turns: bool = False
+) -> Iterator[pd.DataFrame]:
     """Yield a channel as tables of limited size, in log order: at least one, which may be empty.
 
     Parameters
     ----------
     name : one of :data:`TABLES`.
     run : the run to read; None for a recorded channel.
+    with_turns : tracks have the columns of bodies that are not level, also if the rig has none.
 
     Raises
     ------
@@ -143,7 +149,7 @@ def read_table_parts(session: Session, name: str, run: str | None) -> Iterator[p
     """
     pandas = _import_for(name)
     if name in _ITEMS:
-        for part in _item_parts(session, _ITEMS[name], run, None, None):
+        for part in _item_parts(session, _ITEMS[name], run, None, None, with_turns):
             yield _typed(pandas, pandas.DataFrame(part, copy=False))
     else:
         yield _read_run(pandas, session, name, run, None, None)
@@ -173,8 +179,15 @@ def _read_run(
 
 
 def _item_parts(
-    session: Session, table: _Table, run: str | None, start_ns: int | None, end_ns: int | None
+    session: Session,
+    table: _Table,
+    run: str | None,
+    start_ns: int | None,
+    end_ns: int | None,
+    with_turns: bool = False,
 ) -> Iterator[dict[str, Any]]:
+    if table.payload is Tracks and (with_turns or _has_free_body(session)):
+        table = table._replace(fields=(*table.fields, *_TURN))
     topics = session.topics(table.channel, run)
     items = session.part_counter()
     has_camera = "{camera}" in table.channel.topic
@@ -193,6 +206,12 @@ def _item_parts(
             raise LogError(f"{session}: {table.channel.name}: {error}") from error
         part = _part(columns, times.reshape(-1, 2), cameras, table)
         yield segments.add(part) if "robot" in part else part
+
+
+def _has_free_body(session: Session) -> bool:
+    """Return whether a rig of the log, or of one of its runs, has a body that is not level."""
+    rigs = [*session.payloads(session.topics(RIG)), *(record.rig for record in session.runs() if record.rig)]
+    return any(not body.level for rig in rigs for body in rig.bodies)
 
 
 class _Segments:
@@ -270,6 +289,17 @@ _EXPAND: dict[str, _Expand] = {
     "velocity_covariance_m2_s2": _elements(
         [f"cov_v{axes[0]}_v{axes[1]}_m2_s2" for axes in _COVARIANCE], [*_COVARIANCE.values()], 9
     ),
+    "rotation_rad": _elements([f"{angle}_rad" for angle in _ANGLES], range(3), 3),
+    "pose_covariance": _elements(
+        [
+            f"cov_{first}_{_ANGLES[column]}_{'m_rad' if row < 3 else 'rad2'}"
+            for row, first in enumerate(("x", "y", "z", *_ANGLES))
+            for column in range(max(row - 3, 0), 3)
+        ],
+        [6 * row + column for row in range(6) for column in range(max(row, 3), 6)],
+        36,
+    ),
+    "angular_velocity_rad_s": _elements(["wx_rad_s", "wy_rad_s", "wz_rad_s"], range(3), 3),
     "corners_px": _elements(_CORNERS, range(8), 8),
     "inside": _optional_flag,
     "time_offset_ns": _optional_integer,

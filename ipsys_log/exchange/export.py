@@ -9,14 +9,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.data_frames import read_table_parts
 from ipsys_log.extras import check_installed
 from ipsys_log.log.atomic_files import replacement_of
 from ipsys_log.log.dataset import Session
+from ipsys_log.messages import Track
 from ipsys_log.units import NS_PER_S
+from ipsys_log.vision.bodies import track_quaternion, track_rotation
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -183,8 +184,8 @@ def export_trajectory(session: Session, name: str, run: str | None, path: Path, 
     """
     write_line = {"tum": _tum_line, "kitti": _kitti_line}[TRAJECTORIES[path.suffix.lower()]]
     known: set[str] = set()
-    poses: dict[int, list[float]] = {}
-    for part in read_table_parts(session, name, run):
+    poses: dict[int, Track] = {}
+    for part in read_table_parts(session, name, run, with_turns=True):
         known.update(part["robot"].unique().tolist())
         if robot is None and len(known) > 1:
             raise IpsysError(f"{session}: {name} has the robots {_listed(known)}; choose one with --robot")
@@ -192,26 +193,28 @@ def export_trajectory(session: Session, name: str, run: str | None, path: Path, 
         rows = rows[rows["heading_rad"].notna()]
         times_ns = rows["time"].dt.tz_localize(None).to_numpy().astype(np.int64).tolist()
         values = rows[["x_m", "y_m", "z_m", "heading_rad"]].to_numpy().tolist()
-        poses.update(zip(times_ns, values, strict=True))
+        turns_rad = rows[["rx_rad", "ry_rad", "rz_rad"]].to_numpy()
+        for time_ns, value, turn_rad in zip(times_ns, values, turns_rad, strict=True):
+            x_m, y_m, z_m, heading_rad = value
+            known_rad = turn_rad if np.isfinite(turn_rad).all() else None
+            poses[time_ns] = Track("", 0, x_m, y_m, z_m, heading_rad, rotation_rad=known_rad)
     if robot is not None and robot not in known:
         raise _unknown_robot(session, name, [run], robot)
     if not poses:
         raise IpsysError(f"{session}: {name} has no row with a heading; export the table as .csv instead")
     with replacement_of(path) as file:
-        file.writelines(write_line(time_ns, *poses[time_ns]).encode() for time_ns in sorted(poses))
+        file.writelines(write_line(time_ns, poses[time_ns]).encode() for time_ns in sorted(poses))
     return len(poses)
 
 
-def _tum_line(time_ns: int, x_m: float, y_m: float, z_m: float, heading_rad: float) -> str:
-    turn = float(np.sin(heading_rad / 2)), float(np.cos(heading_rad / 2))
+def _tum_line(time_ns: int, pose: Track) -> str:
     seconds = f"{time_ns // NS_PER_S}.{time_ns % NS_PER_S:09d}"
-    return f"{seconds} {x_m!r} {y_m!r} {z_m!r} 0.0 0.0 {turn[0]!r} {turn[1]!r}\n"
+    return " ".join([seconds, *map(repr, (pose.x_m, pose.y_m, pose.z_m, *track_quaternion(pose)))]) + "\n"
 
 
-def _kitti_line(_: int, x_m: float, y_m: float, z_m: float, heading_rad: float) -> str:
-    c, s = float(np.cos(heading_rad)), float(np.sin(heading_rad))
-    row: NDArray[np.float64] = np.array([c, -s, 0, x_m, s, c, 0, y_m, 0, 0, 1, z_m])
-    return " ".join(map(repr, row.tolist())) + "\n"
+def _kitti_line(_: int, pose: Track) -> str:
+    rows = np.column_stack([track_rotation(pose), (pose.x_m, pose.y_m, pose.z_m)])
+    return " ".join(map(repr, rows.ravel().tolist())) + "\n"
 
 
 def _unknown_robot(session: Session, name: str, runs: Sequence[str | None], robot: str) -> IpsysError:

@@ -205,8 +205,17 @@ class Rig:
         return [m.id for m in self.markers if self.height_of(m.id) is None and not self.is_free(m.id)]
 
     def robot_heights_m(self) -> dict[str, float | None]:
-        """Return the robots that the rig names, with the heights of their markers in m (None: unknown)."""
-        return {marker.robot: self.height_of(marker.id) for marker in self.markers if marker.robot}
+        """Return the robots that the rig names, with the heights of their pivots above the floor in m.
+
+        None: the height is unknown, or the robot is not level.
+        """
+        heights_m = {marker.robot: self.height_of(marker.id) for marker in self.markers if marker.robot}
+        first = {marker.robot: marker for marker in reversed(self.markers)}
+        for body in self.bodies:
+            marker = first.get(body.robot)
+            if marker is not None and (height_m := self.height_of(marker.id)) is not None:
+                heights_m[body.robot] = height_m + sum(body.pivot_m[2:]) - sum(marker.xyz_m[2:])
+        return heights_m
 
     def knows(self, marker_id: int) -> bool:
         """Return whether an id is in use: it is listed, or the rig lists no markers of robots."""

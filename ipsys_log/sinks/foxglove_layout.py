@@ -116,13 +116,17 @@ def _floor(session: Session, runs: Sequence[str], rig: Rig | None) -> Panel:
     return panel
 
 
-def _robots(rig: Rig | None) -> list[str]:
-    markers = rig.markers if rig is not None else ()
-    return list(dict.fromkeys(marker.robot or f"marker_{marker.id}" for marker in markers))[:_MOST_ROBOTS]
+def _robots(rig: Rig | None) -> dict[str, str]:
+    """Return the axes to plot by robot: z only of robots that are not level."""
+    if rig is None:
+        return {}
+    names = list(dict.fromkeys(marker.robot or f"marker_{marker.id}" for marker in rig.markers))
+    free = {body.robot for body in rig.bodies if not body.level}
+    return {name: "xyz" if name in free else "xy" for name in names[:_MOST_ROBOTS]}
 
 
 def _plots(
-    session: Session, runs: Sequence[str], robots: Sequence[str], cameras: Sequence[str]
+    session: Session, runs: Sequence[str], robots: Mapping[str, str], cameras: Sequence[str]
 ) -> tuple[dict[str, Panel], dict[str, Any]]:
     """Return the plots that the log has data for, and the user scripts that they need."""
     plots, scripts = {}, {}
@@ -132,8 +136,8 @@ def _plots(
             "Position, m",
             {
                 f"{robot} {axis}": f'{tracks[0]}.tracks[:]{{robot=="{robot}"}}.{axis}_m'
-                for robot in robots
-                for axis in "xy"
+                for robot, axes in robots.items()
+                for axis in axes
             },
         )
     if tracks and session.count(TRUTH_TOPIC):

@@ -7,12 +7,20 @@ has those of its first marker, if this one has no pose of its own.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import atan2, hypot
 
 import numpy as np
 
 from ipsys_log.messages import Array, Rig, Track
 from ipsys_log.vision.markers import marker_corners
-from ipsys_log.vision.poses import level_turns, make_pose, rotation, transform
+from ipsys_log.vision.poses import (
+    level_turns,
+    make_pose,
+    rotation,
+    transform,
+    turn_about_z,
+    vector_quaternion,
+)
 
 # Relative error of a printed side, and of a distance that is measured by hand.
 _SCALE_SIGMA = 0.001
@@ -94,4 +102,16 @@ def track_rotation(track: Track) -> Array:
     """
     if track.rotation_rad is not None:
         return rotation(track.rotation_rad)
-    return rotation(np.array([0.0, 0.0, track.heading_rad or 0.0]))
+    return turn_about_z(track.heading_rad or 0.0)
+
+
+def track_tilt_rad(track: Track) -> float:
+    """Return the angle between the vertical and the z axis of a robot."""
+    x, y, z = track_rotation(track)[:, 2].tolist()
+    return atan2(hypot(x, y), z)
+
+
+def track_quaternion(track: Track) -> tuple[float, float, float, float]:
+    """Return the same as a quaternion (x, y, z, w)."""
+    level_rad = np.array([0.0, 0.0, track.heading_rad or 0.0])
+    return vector_quaternion(level_rad if track.rotation_rad is None else track.rotation_rad)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import cos, hypot, sin
 
 import cv2
 import numpy as np
@@ -126,6 +127,22 @@ def quaternion(rotation: Array) -> tuple[float, float, float, float]:
 
     x, y, z, w = Rotation.from_matrix(rotation).as_quat().tolist()
     return x, y, z, w
+
+
+def vector_quaternion(vector_rad: Array) -> tuple[float, float, float, float]:
+    """Return the quaternion (x, y, z, w) of a rotation vector (3,)."""
+    # A turn about one axis keeps every digit of its sine and cosine.
+    x, y, z = np.asarray(vector_rad, dtype=np.float64).tolist()
+    angle_rad = hypot(x, y, z)
+    size = angle_rad or 1.0
+    half = sin(angle_rad / 2)
+    return x / size * half, y / size * half, z / size * half, cos(angle_rad / 2)
+
+
+def turn_about_z(angle_rad: float) -> Array:
+    """Return the rotation (3, 3) about the z axis; its zeros and ones are exact."""
+    c, s = cos(angle_rad), sin(angle_rad)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def level_turns(headings_rad: Array) -> Array:

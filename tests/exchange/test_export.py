@@ -13,10 +13,12 @@ import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
 import pytest
+from scipy.spatial.transform import Rotation
 
 import ipsys_log as ipsys
 from ipsys_log import IpsysError
 from ipsys_log.exchange import data_frames
+from tests.sinks.streaming import TILT_RAD, tilted_track, write_tilted
 
 
 @pytest.fixture(scope="module")
@@ -160,3 +162,30 @@ def test_failed_export_keeps_the_old_file(log: Path, tmp_path: Path, monkeypatch
         opened.export(path)
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_tables_of_tilted_robots_have_their_rotations(tmp_path: Path) -> None:
+    sent = tilted_track("ada")
+    with ipsys.open(write_tilted(tmp_path / "a.mcap")) as opened:
+        table = opened.table("tracks", run="poly")
+        opened.export(tmp_path / "a.parquet", "tracks", run="poly")
+    assert list(pd.read_parquet(tmp_path / "a.parquet")) == list(table)
+    ada, bob = (table[table["robot"] == robot].iloc[0] for robot in ("ada", "bob"))
+    assert ada[["rx_rad", "ry_rad", "rz_rad"]].tolist() == TILT_RAD.tolist()
+    assert ada[["wx_rad_s", "wy_rad_s", "wz_rad_s"]].tolist() == [0.3, -0.4, 0.1]
+    assert sent.pose_covariance is not None
+    names = {"cov_x_rx_m_rad": (0, 3), "cov_z_ry_m_rad": (2, 4), "cov_rx_rz_rad2": (3, 5)}
+    assert ada[[*names]].tolist() == [sent.pose_covariance[place] for place in names.values()]
+    assert bob[["rx_rad", "wz_rad_s", *names]].isna().all()
+    with ipsys.open(write_tilted(tmp_path / "level.mcap", is_level=True)) as opened:
+        assert "rx_rad" not in opened.table("tracks", run="poly")
+
+
+def test_trajectories_of_tilted_robots_have_their_rotations(tmp_path: Path) -> None:
+    with ipsys.open(write_tilted(tmp_path / "a.mcap")) as opened:
+        for suffix in ("tum", "kitti"):
+            opened.export(tmp_path / f"a.{suffix}", "tracks", run="poly", robot="ada")
+    turn = Rotation.from_rotvec(TILT_RAD)
+    assert np.loadtxt(tmp_path / "a.tum")[0, 1:] == pytest.approx([1.0, 2.0, 0.1, *turn.as_quat()])
+    matrix = np.loadtxt(tmp_path / "a.kitti")[0].reshape(3, 4)
+    assert matrix == pytest.approx(np.column_stack([turn.as_matrix(), [1.0, 2.0, 0.1]]))

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import io
 import math
+from dataclasses import replace
 
+import numpy as np
 from rich.console import Console
 
 from ipsys_log.app.report.cameras import robots_table
@@ -20,9 +22,11 @@ def shown(tracks: list[Track]) -> list[list[str]]:
 def test_positions_are_in_cm_and_headings_in_degrees() -> None:
     ada = Track("ada", 7, 1.234, 0.5, 0.1, math.radians(90), cameras=("red", "white"))
     bare = Track("marker_3", 3, -0.05, 2.0, 0.0)
-    heading, first, second = shown([bare, ada])
+    tilted = replace(ada, robot="bob", id=8, rotation_rad=np.array([math.radians(20), 0.0, 0.0]))
+    heading, first, third, second = shown([bare, ada, tilted])
     assert heading == ["robot", "x", "cm", "y", "cm", "z", "cm", "heading", "cameras"]
     assert first == ["ada", "123.4", "50.0", "10.0", "90", "deg", "red,", "white"]
+    assert third[4:8] == ["90", "deg,", "tilt", "20"]
     assert second == ["marker_3", "-5.0", "200.0", "0.0", "-"]
 
 

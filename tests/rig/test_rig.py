@@ -223,3 +223,14 @@ def test_the_floor_itself_is_a_height() -> None:
 def test_only_the_password_is_hidden(address: str, shown: str) -> None:
     assert hide_password(address) == shown
     assert hide_password(shown) == shown
+
+
+def test_floor_is_below_the_pivots_of_level_robots_only() -> None:
+    markers = (
+        RigMarker(0, robot="ada", height_m=0.3, xyz_m=(0.0, 0.0, 0.1)),
+        RigMarker(1, robot="bob", height_m=0.2),
+        RigMarker(2, robot="eve", height_m=0.2),
+    )
+    bodies = (RigBody("ada", level=True, pivot_m=(0.1, 0.0, -0.15)), RigBody("eve", level=False))
+    heights_m = Rig("lab", "DICT_4X4_100", 0.2, markers, bodies=bodies).robot_heights_m()
+    assert heights_m == {"ada": pytest.approx(0.05), "bob": 0.2, "eve": None}

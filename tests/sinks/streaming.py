@@ -10,10 +10,11 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ipsys_log.capture.frames import Clock
 from ipsys_log.engine.output import write_log
-from ipsys_log.messages import Message, Rig, RigMarker, Track, Tracks
+from ipsys_log.messages import Message, Rig, RigBody, RigMarker, Run, Track, Tracks
 from ipsys_log.sinks.sink import InlineSink
 from ipsys_log.statistics.latency import PositionState
 from ipsys_log.units import NS_PER_S
@@ -21,6 +22,7 @@ from ipsys_log.units import NS_PER_S
 START_NS = 1_700_000_000 * NS_PER_S
 STEP_NS = NS_PER_S // 25
 TOPIC = "/runs/poly/tracks"
+TILT_RAD = np.array([0.5, -0.3, 2.0])
 RIG = Rig("lab", "DICT_4X4_100", 0.2, (RigMarker(0, robot="ada"), RigMarker(1, robot="bob")))
 
 
@@ -38,6 +40,21 @@ def moving_track(robot: str, heading_rad: float) -> Track:
         heading_sigma_rad=0.02,
         turn_rate_rad_s=0.1,
         turn_rate_sigma_rad_s=0.03,
+    )
+
+
+def tilted_track(robot: str) -> Track:
+    """Return the track of a body that is not level, with correlated uncertainties."""
+    errors = np.random.default_rng(5).normal(size=(6, 6)) * 0.01
+    pose = errors @ errors.T
+    x_m, y_m, _ = Rotation.from_rotvec(TILT_RAD).apply([1.0, 0.0, 0.0])
+    return replace(
+        moving_track(robot, float(np.arctan2(y_m, x_m))),
+        covariance_m2=pose[:3, :3],
+        velocity_m_s=np.array([0.5, -0.2, 0.3]),
+        rotation_rad=TILT_RAD,
+        pose_covariance=pose,
+        angular_velocity_rad_s=np.array([0.3, -0.4, 0.1]),
     )
 
 
@@ -61,6 +78,17 @@ def write_tracks(path: Path, count: int = 50, first: int = 0, rig: Rig = RIG) ->
         yield from (tracks(first + number) for number in range(count))
 
     write_log(path, messages())
+    return path
+
+
+def write_tilted(path: Path, is_level: bool = False) -> Path:
+    """Write a log with the tracks of ada, which can tilt, and of bob, which is level."""
+    bodies = (RigBody("ada", level=is_level),)
+    messages = [tracks(number, tilted_track("ada"), track("bob", 3.0, 0.4)) for number in range(2)]
+    rig = Message("/rig", START_NS, START_NS, replace(RIG, bodies=bodies))
+    end_ns = messages[-1].log_time_ns
+    record = Message("/runs/poly/record", end_ns, end_ns, Run(end_ns, "poly", "fuse", number=1))
+    write_log(path, [rig, *messages, record])
     return path
 
 

@@ -21,6 +21,7 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages import LATENCY_TOPIC, CompressedImage, Latency, Message, image_topic
 from ipsys_log.sinks.foxglove_layout import _grid, make_layout
 from tests.conftest import ROOT, Ipsys
+from tests.sinks.streaming import write_tilted
 
 _SCORED = ROOT / "tests" / "golden" / "v0_1_0.mcap"
 _PATH = re.compile(r'(/[\w/]+?)(?:\.(\w+)\[:\])?\{(\w+)=="(\w+)"\}\.(\w+)')
@@ -272,3 +273,9 @@ def test_images_of_many_cameras_are_as_large_as_possible(count: int, least_px: f
     tiles = tile_sizes(_grid([f"Image!{n}" for n in range(count)]), 0.4 * 1920, 1080)
     assert len(tiles) == count
     assert min(min(width, (height - 30) * 16 / 9) for width, height in tiles) >= least_px - 1
+
+
+def test_height_is_plotted_of_robots_that_are_not_level(tmp_path: Path) -> None:
+    with Session([write_tilted(tmp_path / "a.mcap")]) as session:
+        paths = make_layout(session, ["poly"])["configById"]["Plot!position"]["paths"]
+    assert [path["label"] for path in paths] == ["ada x", "ada y", "ada z", "bob x", "bob y"]

@@ -14,13 +14,25 @@ import numpy as np
 import pytest
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import common
+from scipy.spatial.transform import Rotation
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Message
 from ipsys_log.sinks.streams.mavlink import MavlinkStream, parse_endpoint
 from ipsys_log.sinks.streams.poses import NewSession, PoseSource
 from tests.sinks.autopilots import ardupilot, px4
-from tests.sinks.streaming import START_NS, STEP_NS, TOPIC, judged, moving_track, send_all, track, tracks
+from tests.sinks.streaming import (
+    START_NS,
+    STEP_NS,
+    TILT_RAD,
+    TOPIC,
+    judged,
+    moving_track,
+    send_all,
+    tilted_track,
+    track,
+    tracks,
+)
 
 _LIMIT_S = 240.0
 NOW_NS = START_NS + 7
@@ -134,6 +146,8 @@ TRACKS = {
     "no_covariance": replace(moving_track("ada", 0.4), covariance_m2=None, velocity_covariance_m2_s2=None),
     "broken_covariance": replace(moving_track("ada", 0.4), covariance_m2=np.full((3, 3), np.nan)),
     "facing_back": moving_track("ada", -np.pi),
+    "tilted": tilted_track("ada"),
+    "tilted_without_covariance": replace(tilted_track("ada"), pose_covariance=None),
 }
 
 
@@ -154,7 +168,8 @@ def test_both_autopilots_use_position_and_yaw(autopilot: Autopilot, message: str
         assert (reading.velocity_m_s is not None) == has_velocity
     is_known = name not in ("no_covariance", "broken_covariance")
     assert (px4(received).sigma_m is not None) == is_known
-    assert px4(received).yaw_sigma_rad == pytest.approx(0.1 if name == "no_heading_sigma" else 0.02)
+    if name != "tilted":
+        assert px4(received).yaw_sigma_rad == pytest.approx(0.1 if name == "no_heading_sigma" else 0.02)
     # ArduPilot: 0 is "take the noise floors".
     assert (ardupilot(received).sigma_m != (0.0,)) == is_known
     assert received.reset_counter == 300 % 256
@@ -181,6 +196,37 @@ def test_covariance_of_the_velocity_is_along_the_robot(autopilot: Autopilot) -> 
     assert diagonal == pytest.approx([4e-4, 1e-4, 9e-4, 0.03**2])
     assert last.pose_covariance[20] == pytest.approx(0.02**2)
     assert np.isfinite(last.velocity_covariance).all()
+
+
+def test_tilted_robot_has_its_rotation_in_the_axes_of_the_autopilot(autopilot: Autopilot) -> None:
+    """North is y, east is x; the covariance is that of roll, pitch and yaw of many drawn poses."""
+    sent = tilted_track("ada")
+    with streaming(autopilot) as (stream, _), streaming(autopilot, "/vision") as (other, _):
+        send_all(stream, [tracks(0, sent)])
+        send_all(other, [tracks(0, sent)])
+        odometry, vision = autopilot.next("ODOMETRY"), autopilot.next("VISION_POSITION_ESTIMATE")
+    ned_from_lab = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]])
+    errors = np.random.default_rng(0).multivariate_normal(
+        np.zeros(6), np.asarray(sent.pose_covariance), 100_000
+    )
+    drawn = Rotation.from_rotvec([*errors[:, 3:], [0, 0, 0]]) * Rotation.from_rotvec(TILT_RAD)
+    bodies = Rotation.from_matrix(ned_from_lab @ drawn.as_matrix() @ np.diag([1, -1, -1]))
+    w, *xyz = odometry.q
+    assert (Rotation.from_quat([*xyz, w]).inv() * bodies[-1]).magnitude() == pytest.approx(0.0, abs=1e-6)
+    yaw_pitch_roll = bodies.as_euler("ZYX")
+    assert [vision.yaw, vision.pitch, vision.roll] == pytest.approx(yaw_pitch_roll[-1], abs=1e-6)
+    to_body = bodies[-1].inv()
+    assert [odometry.vx, odometry.vy, odometry.vz] == pytest.approx(
+        to_body.apply(ned_from_lab @ sent.velocity_m_s), abs=1e-6
+    )
+    assert [odometry.rollspeed, odometry.pitchspeed, odometry.yawspeed] == pytest.approx(
+        to_body.apply(ned_from_lab @ sent.angular_velocity_rad_s), abs=1e-6
+    )
+    assert [isnan(odometry.velocity_covariance[n]) for n in (0, 15, 18, 20)] == [False, True, True, True]
+    state = np.column_stack([errors[:, :3] @ ned_from_lab.T, np.unwrap(yaw_pitch_roll[:-1, ::-1], axis=0)])
+    upper = np.cov(state.T)[np.triu_indices(6)]
+    for stated in (odometry.pose_covariance, vision.covariance):
+        assert stated == pytest.approx(upper, rel=0.03, abs=2e-6)
 
 
 def test_new_session_raises_the_reset_counter(autopilot: Autopilot) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import rerun as rr
 from rerun.chunk import RrdReader
+from scipy.spatial.transform import Rotation
 
 from ipsys_log.engine.output import write_log
 from ipsys_log.errors import IpsysError, LogError
@@ -279,6 +280,14 @@ def test_robot_without_heading_loses_its_arrow(tmp_path: Path) -> None:
     assert [row[0] for row in rows(saved, arrow, "Clear:is_recursive")] == [TIMES_NS[2]]
     assert looks_at(saved, arrow, "Arrows3D", "vectors", "colors").keys() == {TIMES_NS[n] for n in (0, 1, 4)}
     assert None not in looks_at(saved, arrow, "Arrows3D", "vectors", "colors").values()
+
+
+def test_robot_that_can_tilt_has_arrows_forward_and_up(tmp_path: Path) -> None:
+    sent = Tracks(START_NS, (Track("a", 0, 1, 2, 0.1, 2.0, rotation_rad=np.array([0.5, -0.3, 2.0])),))
+    saved = drawn_by(tmp_path / "a.rrd", [Message("/runs/poly/tracks", START_NS, START_NS, sent)])
+    ((_, _, vectors),) = rows(saved, "/world/runs/poly/robots/a/heading", "Arrows3D:vectors")
+    turn = Rotation.from_rotvec([0.5, -0.3, 2.0])
+    assert np.array(vectors) == pytest.approx(turn.apply([[0.3, 0, 0], [0, 0, 0.15]]), abs=1e-6)
 
 
 def test_unseen_objects_disappear_from_the_view(saved: Path) -> None:

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 import zenoh
+from scipy.spatial.transform import Rotation
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Message
@@ -26,7 +27,18 @@ from ipsys_log.sinks.streams.ros2_messages import type_hash
 from ipsys_log.units import NS_PER_S
 from tests.ports import free_port
 from tests.sinks.open_sockets import exposed
-from tests.sinks.streaming import START_NS, STEP_NS, TOPIC, judged, moving_track, send_all, track, tracks
+from tests.sinks.streaming import (
+    START_NS,
+    STEP_NS,
+    TILT_RAD,
+    TOPIC,
+    judged,
+    moving_track,
+    send_all,
+    tilted_track,
+    track,
+    tracks,
+)
 from tests.sinks.zenoh_listener import ZenohListener, open_node
 from tests.waiting import wait_until
 
@@ -158,6 +170,27 @@ def test_odometry_has_the_variances_along_the_robot() -> None:
     assert np.diag(np.reshape(twist.covariance, (6, 6))) == pytest.approx(expected)
     for one in (pose.pose, odometry.pose):
         assert np.diag(np.reshape(one.covariance, (6, 6)))[5] == pytest.approx(0.02**2)
+
+
+def test_tilted_robot_has_its_rotation_and_twist() -> None:
+    """nav_msgs: the pose and its covariance are along and about the axes of map, the twist of the robot."""
+    topics, sent = ("/tf", "/ada/pose", "/ada/odom"), tilted_track("ada")
+    with streaming() as (stream, _), listening(stream, *topics) as listener:
+        send_all(stream, [tracks(0, sent)])
+        (transforms,), (pose,), (odometry,) = (listener.messages(topic) for topic in topics)
+    map_from_robot = Rotation.from_rotvec(TILT_RAD)
+    for turn in (transforms.transforms[0].transform.rotation, odometry.pose.pose.orientation):
+        quaternion = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w])
+        assert (quaternion.inv() * map_from_robot).magnitude() == pytest.approx(0.0, abs=1e-12)
+    for stated in (pose.pose.covariance, odometry.pose.covariance):
+        assert np.array_equal(np.reshape(stated, (6, 6)), np.asarray(sent.pose_covariance))
+    twist = odometry.twist.twist
+    for vector, in_map in ((twist.linear, sent.velocity_m_s), (twist.angular, sent.angular_velocity_rad_s)):
+        assert map_from_robot.apply([vector.x, vector.y, vector.z]) == pytest.approx(in_map)
+    covariance = np.reshape(odometry.twist.covariance, (6, 6))
+    axes = map_from_robot.as_matrix()
+    assert axes @ covariance[:3, :3] @ axes.T == pytest.approx(sent.velocity_covariance_m2_s2)
+    assert np.diag(covariance)[3:].tolist() == [1e6] * 3  # a track does not state them
 
 
 def test_node_and_publishers_are_in_the_graph() -> None:

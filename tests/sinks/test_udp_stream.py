@@ -6,30 +6,37 @@ import hashlib
 import hmac
 import json
 import re
+import runpy
 import socket
+import struct
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import ipsys_log as ipsys
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Message
 from ipsys_log.sinks.streams.poses import NewSession, PoseSource
+from ipsys_log.sinks.streams.ros2_messages import encode_odometry, type_hash
 from ipsys_log.sinks.streams.udp import UdpStream, encode_pose
 from ipsys_log.units import NS_PER_S
 from tests.conftest import ROOT
 from tests.sinks.streaming import (
     START_NS,
     STEP_NS,
+    TILT_RAD,
     TOPIC,
     judged,
     moving_track,
     send_all,
+    tilted_track,
     track,
     tracks,
     write_tracks,
@@ -48,6 +55,10 @@ def receiver() -> Receive:
     exec(block, names)
     receive: Receive = names["receive"]
     return receive
+
+
+def example(name: str) -> dict[str, Any]:
+    return runpy.run_path(str(ROOT / "examples" / "udp" / name))
 
 
 @pytest.fixture
@@ -175,6 +186,7 @@ def test_pose_that_arrives_late_is_not_sent() -> None:
 
 def test_poses_without_numbers_are_not_sent() -> None:
     log = [tracks(0, track("ada", float("nan"))), tracks(1, track("ada", 1.0, float("inf")))]
+    log += [tracks(2, replace(tilted_track("ada"), rotation_rad=np.array([0.0, np.nan, 0.0])))]
     assert poses_of(log) == []
     broken = replace(track("ada", 1.0), covariance_m2=np.full((3, 3), np.nan))
     (pose,) = poses_of([tracks(0, broken)])
@@ -186,6 +198,71 @@ def test_uncertainty_of_velocity_and_heading_is_sent() -> None:
     fields = json.loads(encode_pose(pose))
     assert fields["velocity_covariance_m2_s2"] == pytest.approx(np.diag([1e-4, 4e-4, 9e-4]).ravel().tolist())
     assert (fields["heading_sigma_rad"], fields["yaw_sigma_rad_s"]) == (0.02, 0.03)
+
+
+def test_tilted_robot_has_further_fields() -> None:
+    (pose,) = poses_of([tracks(0, sent := tilted_track("ada"))])
+    body = encode_pose(pose, KEY)
+    assert len(body) < 1472  # one packet of Ethernet
+    fields = json.loads(body.partition(b"\n")[0])
+    turned = Rotation.from_quat(fields["quaternion"]).as_rotvec()
+    assert turned == pytest.approx(TILT_RAD, abs=1e-5)
+    assert fields["pose_covariance"] == pytest.approx(np.ravel(np.asarray(sent.pose_covariance)), rel=1e-3)
+    assert fields["angular_rad_s"] == [0.3, -0.4, 0.1]
+    (level,) = poses_of([tracks(0, moving_track("ada", 0.0))])
+    assert not {"quaternion", "pose_covariance", "angular_rad_s"} & set(json.loads(encode_pose(level)))
+
+
+def test_example_of_the_crazyflie_sends_good_poses_to_it() -> None:
+    """The packet of cflib has the command 8, position and quaternion."""
+    crazyflie = pytest.importorskip("cflib.crazyflie").Crazyflie()
+    packets: list[Any] = []
+    crazyflie.send_packet = packets.append
+    log = [tracks(0, track("ada", 1.0)), tracks(1, tilted_track("ada"))]
+    log.append(tracks(2, replace(tilted_track("ada"), inside=False)))
+    received = [json.loads(encode_pose(pose)) for pose in poses_of(log)]
+    example("crazyflie.py")["follow"](crazyflie, [None, *received])
+    (packet,) = packets
+    command, *pose = struct.unpack("<B7f", packet.data)
+    assert (packet.port, packet.channel, command) == (6, 1, 8)
+    assert pose == pytest.approx([1.0, 2.0, 0.1, *Rotation.from_rotvec(TILT_RAD).as_quat()], abs=1e-6)
+
+
+@pytest.mark.filterwarnings("ignore:module .sre_:DeprecationWarning")  # of a library of ROS 2
+def test_example_for_dds_publishes_odometry_to_nodes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The real rclpy reads the bytes of the stream of ROS 2, too."""
+    rclpy = pytest.importorskip("rclpy")
+    kind = pytest.importorskip("nav_msgs.msg").Odometry
+    deserialize_message = pytest.importorskip("rclpy.serialization").deserialize_message
+    poses = poses_of([tracks(0, tilted_track("ada")), tracks(1, moving_track("ada", 0.4))])
+    expected = [deserialize_message(encode_odometry(pose, pose.velocity), kind) for pose in poses]
+    messages: dict[int, Any] = {}
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    rclpy.init()
+    try:
+        node, other = rclpy.create_node("ipsys"), rclpy.create_node("robot")
+        other.create_subscription(
+            kind, "/ada/odom", lambda m: messages.update({m.header.stamp.nanosec: m}), 10
+        )
+
+        def received() -> Iterator[Any]:
+            while len(messages) < len(poses):  # until the subscription is found
+                for pose in poses:
+                    yield json.loads(encode_pose(pose))
+                    rclpy.spin_once(other, timeout_sec=0.05)
+
+        example("ros2_dds.py")["publish"](node, received())
+        (info, *_) = node.get_publishers_info_by_topic("/ada/odom")
+        assert str(info.topic_type_hash) == type_hash("nav_msgs/msg/Odometry")
+    finally:
+        rclpy.shutdown()
+    for known, (_, message) in zip(expected, sorted(messages.items()), strict=True):
+        assert (message.header, message.child_frame_id) == (known.header, "ada")
+        for place in ("pose.pose.position", "pose.pose.orientation", "twist.twist.linear"):
+            found, stated = (attrgetter(place)(one) for one in (message, known))
+            for axis in stated.get_fields_and_field_types():
+                assert getattr(found, axis) == pytest.approx(getattr(stated, axis), abs=2e-6), place
+    assert messages[0].pose.covariance == pytest.approx(expected[0].pose.covariance, rel=1e-3)
 
 
 def test_velocity_is_the_slope_over_the_turn_of_a_heading() -> None:

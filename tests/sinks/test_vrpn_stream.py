@@ -11,10 +11,12 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
+from dataclasses import replace
 from math import cos, sin
 from typing import Any, NamedTuple
 
 import pytest
+from scipy.spatial.transform import Rotation
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Message
@@ -22,7 +24,7 @@ from ipsys_log.sinks.streams.poses import PoseSource
 from ipsys_log.sinks.streams.vrpn import VrpnStream
 from ipsys_log.units import NS_PER_S
 from tests.conftest import ROOT
-from tests.sinks.streaming import START_NS, STEP_NS, TOPIC, send_all, track, tracks
+from tests.sinks.streaming import START_NS, STEP_NS, TILT_RAD, TOPIC, send_all, tilted_track, track, tracks
 from tests.waiting import wait_until
 
 _LIMIT_S = 240.0
@@ -118,7 +120,7 @@ def test_client_of_motioncapture_gets_the_poses() -> None:
             number = 0
             while not ended.wait(0.01):
                 number += 1
-                yield tracks(number, track("ada", 1.25, 0.5), track("bob", 3.0, -2.0))
+                yield tracks(number, track("ada", 1.25, 0.5), replace(tilted_track("bob"), x_m=3.0))
 
         thread = threading.Thread(target=lambda: send_all(served.server, play()), daemon=True)
         thread.start()
@@ -133,7 +135,8 @@ def test_client_of_motioncapture_gets_the_poses() -> None:
     lines = [line.removeprefix("POSE ") for line in done.stdout.splitlines() if line.startswith("POSE ")]
     poses = dict(map(json.loads, lines))
     assert poses["ada"] == pytest.approx([1.25, 2.0, 0.1, 0, 0, sin(0.25), cos(0.25)], abs=1e-6)
-    assert poses["bob"] == pytest.approx([3.0, 2.0, 0.1, 0, 0, sin(-1.0), cos(-1.0)], abs=1e-6)
+    turn = Rotation.from_rotvec(TILT_RAD).as_quat()
+    assert poses["bob"] == pytest.approx([3.0, 2.0, 0.1, *turn], abs=1e-6)
     # On a busy machine, the client may get too little time to read all messages.
     assert all("is too slow" in event for event in served.events)
 
@@ -151,6 +154,14 @@ def test_reports_have_capture_times_poses_and_velocities() -> None:
     assert pose == pytest.approx([0.06, 2.0, 0.1, 0, 0, sin(0.06), cos(0.06)])
     _, _, *velocity = struct.unpack(">ii8d", reports[5].content)
     assert velocity == pytest.approx([0.5, 0, 0, 0, 0, sin(0.05), cos(0.05), 0.1])
+
+
+def test_velocity_of_a_tilted_robot_has_its_axis() -> None:
+    with serving("ada") as served, connected(served.server) as client:
+        send(served.server, tracks(0, sent := tilted_track("ada")))
+        *velocity, turn_s = struct.unpack(">ii8d", taken(client, 2)[1].content)[2:]
+    assert velocity[:3] == pytest.approx(sent.velocity_m_s)
+    assert Rotation.from_quat(velocity[3:]).as_rotvec() / turn_s == pytest.approx(sent.angular_velocity_rad_s)
 
 
 def test_robot_that_is_seen_later_is_announced() -> None:

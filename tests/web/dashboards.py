@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ipsys_log.app.web.dashboard.app import build_dashboard
 from ipsys_log.app.web.dashboard.operator import Operator
@@ -42,6 +43,8 @@ from tests.playing import WAIT_LIMIT_S
 from tests.stages.drawing import jpeg
 
 BEGIN_NS = 1_700_000_000 * NS_PER_S
+# A turn by 0.5 about the vertical after a tilt of 0.3.
+TILTED = {"rotation_rad": Rotation.from_euler("xz", [0.3, 0.5]).as_rotvec()}
 RIG = Rig(
     "lab",
     "DICT_4X4_100",

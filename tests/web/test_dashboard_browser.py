@@ -11,7 +11,18 @@ import pytest
 from ipsys_log.messages import CameraModel, Model
 from ipsys_log.units import NS_PER_S
 from tests.web.contrast import low_contrasts
-from tests.web.dashboards import BEGIN_NS, LiveLab, event, frame, latency, markers, page_of, robot, tracks
+from tests.web.dashboards import (
+    BEGIN_NS,
+    TILTED,
+    LiveLab,
+    event,
+    frame,
+    latency,
+    markers,
+    page_of,
+    robot,
+    tracks,
+)
 from tests.web.phone import Phone
 from tests.web.test_dashboard_state import LENS, Stream, pairs_of_a_level_camera
 from tests.web.test_measuring_page import FETCHED, says
@@ -195,11 +206,16 @@ def test_late_positions_are_not_live(browser: Phone, lab: LiveLab) -> None:
 @pytest.mark.parametrize("size", [PHONE, WALL], ids=["phone", "wall"])
 def test_page_fits_the_screen_in_both_schemes(browser: Phone, lab: LiveLab, size: tuple[int, int]) -> None:
     lab.operator.seat.claim(False)
+    lab.feed(tracks(lab.time_ns, robot(1, 3.0, 2.0, **TILTED)))
     with page_of(lab.dashboard) as page, opened(browser, page.url, size):
         browser.wait(f"{COUNT.format('figure image')} === 2")
+        says(browser, "#robots", "1 robot_1\t3.00\t2.00\t0.10\t29°\t17°")
         browser.tap("#take")
         says(browser, "#operation", "This device operates")
         assert browser.run("document.documentElement.scrollWidth") <= size[0]
+        assert browser.run(
+            "(e => e.scrollWidth <= e.parentElement.clientWidth)(document.querySelector('#robots'))"
+        )
         # Each field and each part of the page has a name for a screen reader.
         assert browser.run(
             "[...document.querySelectorAll('input, select')].every(one => one.labels.length === 1)"

@@ -27,6 +27,7 @@ from tests.stages.drawing import jpeg
 from tests.web.dashboards import (
     BEGIN_NS,
     RIG,
+    TILTED,
     LiveLab,
     event,
     frame,
@@ -75,7 +76,7 @@ def test_tracks_of_the_shown_run_become_robots(lab: LiveLab) -> None:
         tracks(now_ns, robot(0, 1.0, 2.0), robot(9, 3.0, 1.0, heading_rad=None)),
         tracks(now_ns, robot(0, 9.0, 9.0), run="rigid"),
         tracks(now_ns - 1, robot(0, 8.0, 8.0)),
-        tracks(now_ns, robot(1, 2.0, 2.0, coasting_ns=3 * NS_PER_S, inside=False, cameras=())),
+        tracks(now_ns, robot(1, 2.0, 2.0, coasting_ns=3 * NS_PER_S, inside=False, cameras=(), **TILTED)),
     )
     data = lab.dashboard.robots()
     assert data["now"] == 2000
@@ -85,8 +86,9 @@ def test_tracks_of_the_shown_run_become_robots(lab: LiveLab) -> None:
     assert first["ellipse"] == pytest.approx([0.04895, 0.02448, 0.0])
     # A marker without a robot in the rig is less important, and a missing value is a missing key.
     assert "colour" in first
-    assert not {"colour", "heading", "outside"} & rows["marker_9"].keys()
+    assert not {"colour", "heading", "outside", "z", "tilt"} & rows["marker_9"].keys()
     assert (rows["robot_1"]["seen"], rows["robot_1"]["outside"]) == (-1000, True)
+    assert (rows["robot_1"]["z"], rows["robot_1"]["tilt"]) == (0.1, 0.3)
 
 
 def test_trail_of_a_new_page_has_ten_seconds(lab: LiveLab) -> None:

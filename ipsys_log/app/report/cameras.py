@@ -18,6 +18,7 @@ from ipsys_log.messages import CompressedImage, CompressedVideo, Markers, Messag
 from ipsys_log.statistics.disagreement import OverlapSummary
 from ipsys_log.statistics.latency import PositionMonitor
 from ipsys_log.units import NS_PER_S, format_bytes, format_duration
+from ipsys_log.vision.bodies import track_tilt_rad
 
 # After this time, the measured growth of a log is better than the estimate.
 _SETTLED_S = 5.0
@@ -192,6 +193,8 @@ def robots_table(tracks: Mapping[str, Track]) -> Rows:
     cells = []
     for name, track in order[:_MOST_ROBOTS]:
         heading = "-" if track.heading_rad is None else f"{degrees(track.heading_rad):.0f} deg"
+        if track.rotation_rad is not None:
+            heading += f", tilt {degrees(track_tilt_rad(track)):.0f}"
         position = (cm(value_m, 1) for value_m in (track.x_m, track.y_m, track.z_m))
         cells.append([name, *position, heading, ", ".join(track.cameras)])
     if len(order) > _MOST_ROBOTS:

@@ -188,7 +188,7 @@ class SyncPoint:
         self._shown += isinstance(message.payload, CompressedImage)
         for pose in self._poses.read(message):
             # VRPN and ROS 2 have no poses without a heading.
-            if not self._good_only or (pose.is_good and pose.track.heading_rad is not None):
+            if not self._good_only or pose.is_sendable:
                 self.sent[pose.track.robot] += 1
 
     def wait_for(self, frames: int) -> None:

@@ -22,6 +22,7 @@ from ipsys_log.messages import (
 )
 from ipsys_log.sinks.colours import MARKER_COLOUR, TRUTH_COLOUR, camera_colours, robot_colour
 from ipsys_log.sinks.rerun.scene import TIMELINES, Fading, Segment, Trails
+from ipsys_log.vision.bodies import track_rotation
 
 # Colour model and channels by pixel encoding, all with 8 bits.
 _RAW = {
@@ -314,8 +315,10 @@ class RerunSink:
             self._clear_now(message, heading)
             return
         length_m = _HEADING_M * self._scale
-        ahead = [(length_m * np.cos(track.heading_rad), length_m * np.sin(track.heading_rad), 0.0)]
-        arrow = {"origins": positions, "vectors": ahead}
+        forward, _, up = length_m * track_rotation(track).T
+        # A second arrow shows the tilt of a robot that is not level.
+        arrows = [forward] if track.rotation_rad is None else [forward, up / 2]
+        arrow = {"origins": positions * len(arrows), "vectors": arrows}
         arrow_look = {"colors": [colour], "radii": [0.012 * self._scale]}
         self._log_moved(message, heading, rr.Arrows3D, arrow, arrow_look)
 

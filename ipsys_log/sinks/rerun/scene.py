@@ -23,6 +23,7 @@ _LEGEND = """\
 | sign | meaning |
 |---|---|
 | large point, arrow, line | track of a robot, its heading, its last 15 s |
+| short second arrow | upward direction of a robot that can tilt |
 | small point | position from one camera, in the colour of the camera |
 | grey point, thin grey line | ground truth |
 | grey points | calibration points; yellow: test points |

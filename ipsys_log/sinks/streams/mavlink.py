@@ -15,37 +15,44 @@ from math import cos, nan, pi, sin
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pymavlink.dialects.v20 import common
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.messages import Message, Tracks
+from ipsys_log.messages import Array, Message, Tracks
 from ipsys_log.sinks.sink import DropReport, Warn
 from ipsys_log.sinks.streams.addresses import find_destination, is_loopback, local_address, open_datagrams
 from ipsys_log.sinks.streams.poses import NewSession, PoseSource, StreamContext, StreamPose
+from ipsys_log.vision.bodies import rpy_from_rotation
+from ipsys_log.vision.poses import rotation_vector, turn_about_z, vector_quaternion
 
 _NS_PER_US = 1000
 _RESETS = 256
 # A heading without a stated sigma. The autopilots need a number: this one is the default of PX4.
 _UNKNOWN_YAW_SIGMA_RAD = 0.1
+# From the axes forward, right, down of autopilots to those of ROS: forward, left, up.
+_FLU_FROM_FRD = np.diag([1.0, -1.0, -1.0])
+# The cosine of the pitch above which the uncertainty of the yaw grows no more: it stays finite.
+_LEAST_COSINE = 0.01
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _LocalPose:
-    """A pose in the axes north, east, down, in m and rad; velocities along the axes of the robot.
+    """A pose in the axes north, east, down, in m and rad; velocities along and about the axes of the robot.
 
-    Covariances are the upper triangles, row by row, of 6 x 6: along three axes, and about them.
+    ``turn_rad`` is the rotation vector, and ``rpy_rad`` has roll, pitch and yaw. Covariances are the upper
+    triangles, row by row, of 6 x 6: along three axes, and of roll, pitch and yaw.
     """
 
-    position_m: NDArray[np.float64]
-    yaw_rad: float
-    velocity_m_s: NDArray[np.float64]
-    yaw_rad_s: float
+    position_m: Array
+    turn_rad: Array
+    rpy_rad: tuple[float, float, float]
+    velocity_m_s: Array
+    rates_rad_s: Array
     covariance: list[float]
     velocity_covariance: list[float]
 
 
-def encode_odometry(pose: StreamPose, heading_rad: float, north_rad: float) -> Any:
+def encode_odometry(pose: StreamPose, north_rad: float) -> Any:
     """Return the message ODOMETRY, from LOCAL_FRD to BODY_FRD.
 
     The estimator is VISION: PX4 gives the poses of MOCAP to a topic that its filter does not read. An unknown
@@ -53,21 +60,18 @@ def encode_odometry(pose: StreamPose, heading_rad: float, north_rad: float) -> A
 
     Parameters
     ----------
-    heading_rad : the heading of the robot, from the x axis of the lab to its y axis.
     north_rad : the direction of north, from the x axis of the lab to its y axis.
     """
-    local = _localize(pose, heading_rad, north_rad)
-    turn = [cos(local.yaw_rad / 2), 0.0, 0.0, sin(local.yaw_rad / 2)]
+    local = _localize(pose, north_rad)
+    x, y, z, w = vector_quaternion(local.turn_rad)
     return common.MAVLink_odometry_message(
         pose.time_ns // _NS_PER_US,
         common.MAV_FRAME_LOCAL_FRD,
         common.MAV_FRAME_BODY_FRD,
         *local.position_m.tolist(),
-        turn,
+        [w, x, y, z],
         *local.velocity_m_s.tolist(),
-        nan,
-        nan,
-        local.yaw_rad_s,
+        *local.rates_rad_s.tolist(),
         local.covariance,
         local.velocity_covariance,
         pose.session % _RESETS,
@@ -75,49 +79,74 @@ def encode_odometry(pose: StreamPose, heading_rad: float, north_rad: float) -> A
     )
 
 
-def encode_vision(pose: StreamPose, heading_rad: float, north_rad: float) -> Any:
+def encode_vision(pose: StreamPose, north_rad: float) -> Any:
     """Return the message VISION_POSITION_ESTIMATE with Euler angles; parameters as for ODOMETRY."""
-    local = _localize(pose, heading_rad, north_rad)
+    local = _localize(pose, north_rad)
     return common.MAVLink_vision_position_estimate_message(
         pose.time_ns // _NS_PER_US,
         *local.position_m.tolist(),
-        0.0,
-        0.0,
-        local.yaw_rad,
+        *local.rpy_rad,
         local.covariance,
         pose.session % _RESETS,
     )
 
 
-def _localize(pose: StreamPose, heading_rad: float, north_rad: float) -> _LocalPose:
+def _localize(pose: StreamPose, north_rad: float) -> _LocalPose:
     track, velocity = pose.track, pose.velocity
     local_from_world = np.array(
         [[cos(north_rad), sin(north_rad), 0], [sin(north_rad), -cos(north_rad), 0], [0, 0, -1]]
     )
-    yaw_rad = (north_rad - heading_rad + pi) % (2 * pi) - pi
-    velocity_m_s, yaw_rad_s, velocity_covariance = np.full(3, nan), nan, _upper(None, nan)
+    # A level robot has no roll and pitch, not even by rounding.
+    yaw_rad = (north_rad - (track.heading_rad or 0.0) + pi) % (2 * pi) - pi
+    local_from_body, rpy_rad = turn_about_z(yaw_rad), (0.0, 0.0, yaw_rad)
+    turn_rad = np.array(rpy_rad)
+    if track.rotation_rad is not None:
+        local_from_body = local_from_world @ pose.rotation @ _FLU_FROM_FRD
+        rpy_rad, turn_rad = rpy_from_rotation(local_from_body), rotation_vector(local_from_body)
+    velocity_m_s, rates_rad_s, velocity_covariance = np.full(3, nan), np.full(3, nan), _upper(None, nan)
     if velocity is not None:
-        body_from_local = np.array(
-            [[cos(yaw_rad), sin(yaw_rad), 0], [-sin(yaw_rad), cos(yaw_rad), 0], [0, 0, 1]]
-        )
-        body_from_world = body_from_local @ local_from_world
+        body_from_world = np.ascontiguousarray(local_from_body.T) @ local_from_world
         velocity_m_s = body_from_world @ np.array([velocity.x_m_s, velocity.y_m_s, velocity.z_m_s])
-        yaw_rad_s = nan if velocity.yaw_rad_s is None else -velocity.yaw_rad_s
+        if velocity.angular_rad_s is not None:
+            rates_rad_s = body_from_world @ velocity.angular_rad_s
+        elif velocity.yaw_rad_s is not None:
+            rates_rad_s[2] = -velocity.yaw_rad_s
         known = velocity.covariance_m2_s2
+        # The uncertainty about the vertical gives none about the axes of a tilted robot.
+        sigma_rad_s = velocity.yaw_sigma_rad_s if velocity.angular_rad_s is None else None
         velocity_covariance = _upper(
             None if known is None else body_from_world @ known @ body_from_world.T,
-            nan if velocity.yaw_sigma_rad_s is None else velocity.yaw_sigma_rad_s,
+            nan if sigma_rad_s is None else sigma_rad_s,
         )
     known, sigma_rad = pose.covariance_m2, pose.heading_sigma_rad
     covariance = _upper(
         None if known is None else local_from_world @ known @ local_from_world.T,
         _UNKNOWN_YAW_SIGMA_RAD if sigma_rad is None else sigma_rad,
     )
+    if pose.covariance is not None:
+        covariance = _rpy_covariance(pose.covariance, local_from_world, rpy_rad)
     position_m = local_from_world @ np.array([track.x_m, track.y_m, track.z_m])
-    return _LocalPose(position_m, yaw_rad, velocity_m_s, yaw_rad_s, covariance, velocity_covariance)
+    motion = velocity_m_s, rates_rad_s, covariance, velocity_covariance
+    return _LocalPose(position_m, turn_rad, rpy_rad, *motion)
 
 
-def _upper(known: NDArray[np.float64] | None, yaw_sigma: float) -> list[float]:
+def _rpy_covariance(
+    known: Array, local_from_world: Array, rpy_rad: tuple[float, float, float]
+) -> list[float]:
+    """Return the upper triangle of the covariance of x, y, z, roll, pitch and yaw.
+
+    ``known`` (6, 6) is that of x, y, z and of a turn about the axes of the world.
+    """
+    _, pitch_rad, yaw_rad = rpy_rad
+    # The axes of roll, pitch and yaw. Those of roll and yaw are the same if the robot stands on its nose.
+    steep = max(cos(pitch_rad), _LEAST_COSINE)
+    axes = turn_about_z(yaw_rad) @ np.array([[steep, 0, 0], [0, 1, 0], [-sin(pitch_rad), 0, 1]])
+    local = np.zeros((6, 6))
+    local[:3, :3], local[3:, 3:] = local_from_world, np.linalg.solve(axes, local_from_world)
+    return _triangle(local @ known @ local.T)
+
+
+def _upper(known: Array | None, yaw_sigma: float) -> list[float]:
     """Return the upper triangle of a covariance of 6 x 6; it begins with NaN if ``known`` is None.
 
     ``known`` (3, 3) is the part of x, y and z, and ``yaw_sigma`` the standard deviation about z. A level
@@ -125,6 +154,10 @@ def _upper(known: NDArray[np.float64] | None, yaw_sigma: float) -> list[float]:
     """
     covariance = np.diag(np.full(6, yaw_sigma**2))
     covariance[:3, :3] = nan if known is None else known
+    return _triangle(covariance)
+
+
+def _triangle(covariance: Array) -> list[float]:
     upper: list[float] = covariance[np.triu_indices(6)].tolist()
     return upper
 
@@ -220,9 +253,8 @@ class MavlinkStream:
     def send(self, message: Message) -> None:
         """Send the poses of a message."""
         for pose in self._poses.read(message):
-            heading_rad = pose.track.heading_rad
-            if pose.is_good and heading_rad is not None and pose.time_ns >= 0:
-                self._send(self._encode(pose, heading_rad, self._north_rad))
+            if pose.is_sendable and pose.time_ns >= 0:
+                self._send(self._encode(pose, self._north_rad))
 
     def close(self) -> None:
         """Close the socket."""

@@ -7,13 +7,15 @@ from math import isfinite
 from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ipsys_log.messages import Message, Track, Tracks
-from ipsys_log.messages.message import Mat33
+from ipsys_log.messages import Array, Message, Track, Tracks
+from ipsys_log.messages.message import Mat33, Mat66, Vec3
 from ipsys_log.sinks.sink import Warn
 from ipsys_log.sinks.streams import STALE_S, StreamSettings
 from ipsys_log.statistics.latency import PositionMonitor, PositionState
 from ipsys_log.units import NS_PER_S
+from ipsys_log.vision.bodies import track_quaternion, track_rotation
 
 # Tracks of earlier versions have no velocity. The duration of the poses that give one: a longer one is more
 # precise, and later by half of it.
@@ -21,7 +23,7 @@ _WINDOW_NS, _SHORTEST_NS = NS_PER_S // 5, NS_PER_S // 20
 _FEWEST_POSES = 3
 _NS_PER_MS = NS_PER_S // 1000
 
-_Value = TypeVar("_Value", Mat33, float)
+_Value = TypeVar("_Value", NDArray[np.float64], float)
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +43,8 @@ class Velocity:
     """The velocity of a robot in m/s, and the rate of its heading in rad/s (None: headings are missing).
 
     ``covariance_m2_s2`` (3, 3) and ``yaw_sigma_rad_s`` are their uncertainties; None if these are unknown.
+    ``angular_rad_s`` (3,) is the angular velocity of a robot that is not level; all are in the axes of the
+    world.
     """
 
     x_m_s: float
@@ -49,6 +53,13 @@ class Velocity:
     yaw_rad_s: float | None
     covariance_m2_s2: Mat33 | None = None
     yaw_sigma_rad_s: float | None = None
+    angular_rad_s: Vec3 | None = None
+
+    @property
+    def turn_rad_s(self) -> Vec3:
+        """The angular velocity (3,) of any robot; unknown parts are 0."""
+        level_rad_s = np.array([0.0, 0.0, self.yaw_rad_s or 0.0])
+        return level_rad_s if self.angular_rad_s is None else self.angular_rad_s
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,8 +90,28 @@ class StreamPose:
 
     @property
     def is_good(self) -> bool:
-        """Return whether a protocol without flags may send the pose."""
+        """Return whether a protocol without flags may send the position."""
         return not self.is_stale and not self.is_outside
+
+    @property
+    def is_sendable(self) -> bool:
+        """Return whether a protocol without flags may send the position with its rotation."""
+        return self.is_good and self.track.heading_rad is not None
+
+    @property
+    def rotation(self) -> Array:
+        """The rotation (3, 3) from the axes of the robot to those of the world."""
+        return track_rotation(self.track)
+
+    @property
+    def quaternion(self) -> tuple[float, float, float, float]:
+        """The same as a quaternion (x, y, z, w)."""
+        return track_quaternion(self.track)
+
+    @property
+    def covariance(self) -> Mat66 | None:
+        """The covariance of x, y, z and of a turn about the axes of the world; None for a level robot."""
+        return _finite(self.track.pose_covariance)
 
     @property
     def covariance_m2(self) -> Mat33 | None:
@@ -206,7 +237,8 @@ def _finite(value: _Value | None) -> _Value | None:
 
 def _is_finite(track: Track) -> bool:
     """Return whether a pose is a number; a log of another program may hold others."""
-    return all(map(isfinite, (track.x_m, track.y_m, track.z_m, track.heading_rad or 0.0)))
+    turn_rad = () if track.rotation_rad is None else track.rotation_rad.tolist()
+    return all(map(isfinite, (track.x_m, track.y_m, track.z_m, track.heading_rad or 0.0, *turn_rad)))
 
 
 class _Recent:
@@ -234,7 +266,8 @@ class _Recent:
             return self._slope()
         x_m_s, y_m_s, z_m_s = newest.velocity_m_s.tolist()
         sigmas = _finite(newest.velocity_covariance_m2_s2), _finite(newest.turn_rate_sigma_rad_s)
-        return Velocity(x_m_s, y_m_s, z_m_s, _finite(newest.turn_rate_rad_s), *sigmas)
+        turn = _finite(newest.turn_rate_rad_s), *sigmas, _finite(newest.angular_velocity_rad_s)
+        return Velocity(x_m_s, y_m_s, z_m_s, *turn)
 
     def _slope(self) -> Velocity | None:
         """Return the slope of the poses; None if the poses are too few, or their time is too short."""

@@ -1,14 +1,14 @@
 """Messages of ROS 2: their types, and poses, images and intrinsics by REP 103 and REP 105.
 
 The axes of the lab are those of the frame ``map``: x and y on the floor, z up, m and rad. The frame of a
-robot has the robot's name; its origin is the marker, and x points along the heading.
+robot has the robot's name: it is at its pivot (``base_link``), and x points along the heading.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
-from math import cos, sin, sqrt
+from math import sqrt
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -94,31 +94,30 @@ def optical_frame(camera: str) -> str:
     return f"{camera}_optical_frame"
 
 
-def _rotation(heading_rad: float) -> Any:
-    return make("geometry_msgs/Quaternion", 0.0, 0.0, sin(heading_rad / 2), cos(heading_rad / 2))
-
-
-def _transform(time_ns: int, parent: str, child: str, xyz_m: Iterable[float], rotation: Any) -> Any:
+def _transform(
+    time_ns: int,
+    parent: str,
+    child: str,
+    xyz_m: Iterable[float],
+    turn: Iterable[float] = (0.0, 0.0, 0.0, 1.0),
+) -> Any:
+    rotation = make("geometry_msgs/Quaternion", *turn)
     moved = make("geometry_msgs/Transform", make("geometry_msgs/Vector3", *xyz_m), rotation)
     return make("geometry_msgs/TransformStamped", make_header(time_ns, parent), child, moved)
 
 
-def sendable(poses: Iterable[StreamPose]) -> list[tuple[StreamPose, float]]:
-    """Return the poses that ROS 2 gets, with their headings in rad: current ones, inside, with a stamp."""
-    return [
-        (pose, pose.track.heading_rad)
-        for pose in poses
-        if pose.is_good and pose.track.heading_rad is not None and is_stampable(pose.time_ns)
-    ]
+def sendable(poses: Iterable[StreamPose]) -> list[StreamPose]:
+    """Return the poses that ROS 2 gets: current ones, inside, with a rotation and a stamp."""
+    return [pose for pose in poses if pose.is_sendable and is_stampable(pose.time_ns)]
 
 
-def encode_transforms(poses: Iterable[tuple[StreamPose, float]]) -> bytes:
-    """Return the message of ``/tf`` with poses and their headings in rad."""
+def encode_transforms(poses: Iterable[StreamPose]) -> bytes:
+    """Return the message of ``/tf`` with poses."""
     rows = []
-    for pose, heading_rad in poses:
+    for pose in poses:
         track = pose.track
         xyz_m = (track.x_m, track.y_m, track.z_m)
-        rows.append(_transform(pose.time_ns, MAP, track.robot, xyz_m, _rotation(heading_rad)))
+        rows.append(_transform(pose.time_ns, MAP, track.robot, xyz_m, pose.quaternion))
     return encode(make("tf2_msgs/TFMessage", rows), TF)
 
 
@@ -131,12 +130,12 @@ def encode_static(heights_m: Mapping[str, float], time_ns: int, cameras: Iterabl
     cameras : cameras with a pose; the frame of their images has x right, y down and z forward (REP 103).
     """
     rows = [
-        _transform(time_ns, robot, f"{robot}/floor", (0.0, 0.0, -height_m), _rotation(0.0))
+        _transform(time_ns, robot, f"{robot}/floor", (0.0, 0.0, -height_m))
         for robot, height_m in heights_m.items()
     ]
     for camera in cameras:
-        rotation = make("geometry_msgs/Quaternion", *quaternion(camera.camera_from_world.T))
-        rows.append(_transform(time_ns, MAP, optical_frame(camera.name), camera.origin_m.tolist(), rotation))
+        turn = quaternion(camera.camera_from_world.T)
+        rows.append(_transform(time_ns, MAP, optical_frame(camera.name), camera.origin_m.tolist(), turn))
     return encode(make("tf2_msgs/TFMessage", rows), TF)
 
 
@@ -145,42 +144,42 @@ def encode_clock(time_ns: int) -> bytes:
     return encode(make("rosgraph_msgs/Clock", make_time(time_ns)), CLOCK)
 
 
-def encode_pose(pose: StreamPose, heading_rad: float) -> bytes:
+def encode_pose(pose: StreamPose) -> bytes:
     """Return the message PoseWithCovarianceStamped of a pose."""
-    message = make(
-        "geometry_msgs/PoseWithCovarianceStamped", make_header(pose.time_ns, MAP), _pose(pose, heading_rad)
-    )
-    return encode(message, POSE)
+    header = make_header(pose.time_ns, MAP)
+    return encode(make("geometry_msgs/PoseWithCovarianceStamped", header, _pose(pose)), POSE)
 
 
-def encode_odometry(pose: StreamPose, heading_rad: float, velocity: Velocity) -> bytes:
-    """Return the message Odometry of a pose; the velocity is along the axes of the robot."""
-    body_from_map = np.array(
-        [[cos(heading_rad), sin(heading_rad), 0], [-sin(heading_rad), cos(heading_rad), 0], [0, 0, 1]]
-    )
+def encode_odometry(pose: StreamPose, velocity: Velocity) -> bytes:
+    """Return the message Odometry of a pose; the velocity is along and about the axes of the robot."""
+    body_from_map = np.ascontiguousarray(pose.rotation.T)
     in_map_m_s = np.array([velocity.x_m_s, velocity.y_m_s, velocity.z_m_s])
     linear = make("geometry_msgs/Vector3", *(body_from_map @ in_map_m_s).tolist())
-    angular = make("geometry_msgs/Vector3", 0.0, 0.0, velocity.yaw_rad_s or 0.0)
+    # The sum makes -0 to 0.
+    angular = make("geometry_msgs/Vector3", *(body_from_map @ velocity.turn_rad_s + 0.0).tolist())
     known = velocity.covariance_m2_s2
+    # The uncertainty about the vertical gives none about the axes of a tilted robot.
+    has_yaw = velocity.yaw_rad_s is not None and velocity.angular_rad_s is None
     covariance = _covariance(
         None if known is None else body_from_map @ known @ body_from_map.T,
-        None if velocity.yaw_rad_s is None else velocity.yaw_sigma_rad_s,
+        velocity.yaw_sigma_rad_s if has_yaw else None,
     )
     twist = make(
         "geometry_msgs/TwistWithCovariance", make("geometry_msgs/Twist", linear, angular), covariance
     )
     header = make_header(pose.time_ns, MAP)
-    message = make("nav_msgs/Odometry", header, pose.track.robot, _pose(pose, heading_rad), twist)
+    message = make("nav_msgs/Odometry", header, pose.track.robot, _pose(pose), twist)
     return encode(message, ODOMETRY)
 
 
-def _pose(pose: StreamPose, heading_rad: float) -> Any:
+def _pose(pose: StreamPose) -> Any:
     track = pose.track
     point = make("geometry_msgs/Point", track.x_m, track.y_m, track.z_m)
-    where = make("geometry_msgs/Pose", point, _rotation(heading_rad))
-    return make(
-        "geometry_msgs/PoseWithCovariance", where, _covariance(pose.covariance_m2, pose.heading_sigma_rad)
-    )
+    where = make("geometry_msgs/Pose", point, make("geometry_msgs/Quaternion", *pose.quaternion))
+    covariance = _covariance(pose.covariance_m2, pose.heading_sigma_rad)
+    if pose.covariance is not None:
+        covariance = pose.covariance.ravel()
+    return make("geometry_msgs/PoseWithCovariance", where, covariance)
 
 
 def _covariance(known: NDArray[np.float64] | None, yaw_sigma: float | None) -> NDArray[np.float64]:
@@ -197,16 +196,16 @@ def _covariance(known: NDArray[np.float64] | None, yaw_sigma: float | None) -> N
     return covariance.ravel()
 
 
-def encode_poses(poses: Iterable[tuple[StreamPose, float]]) -> Iterator[tuple[str, str, bytes]]:
-    """Yield the messages of poses and their headings in rad, each with its topic and its type."""
+def encode_poses(poses: Iterable[StreamPose]) -> Iterator[tuple[str, str, bytes]]:
+    """Yield the messages of poses, each with its topic and its type."""
     poses = list(poses)
     if poses:
         yield "/tf", TF, encode_transforms(poses)
-    for pose, heading_rad in poses:
+    for pose in poses:
         robot = pose.track.robot
-        yield f"/{robot}/pose", POSE, encode_pose(pose, heading_rad)
+        yield f"/{robot}/pose", POSE, encode_pose(pose)
         if pose.velocity is not None:
-            yield f"/{robot}/odom", ODOMETRY, encode_odometry(pose, heading_rad, pose.velocity)
+            yield f"/{robot}/odom", ODOMETRY, encode_odometry(pose, pose.velocity)
 
 
 def encode_diagnostics(

@@ -4,12 +4,12 @@ import hashlib
 import hmac
 import json
 import socket
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.messages import Mat33, Message, Tracks
+from ipsys_log.messages import Array, Message, Tracks
 from ipsys_log.sinks.sink import DropReport, Warn
 from ipsys_log.sinks.streams.addresses import find_destination, is_loopback, local_address, open_datagrams
 from ipsys_log.sinks.streams.poses import NewSession, PoseSource, StreamContext, StreamPose
@@ -41,14 +41,17 @@ def encode_pose(pose: StreamPose, key: bytes | None = None) -> bytes:
         "y_m": round(track.y_m, _DECIMALS),
         "z_m": round(track.z_m, _DECIMALS),
         "heading_rad": _rounded(track.heading_rad),
+        "quaternion": None if track.rotation_rad is None else _rounded_all(pose.quaternion),
     }
     if velocity is not None:
         fields |= {"vx_m_s": _rounded(velocity.x_m_s), "vy_m_s": _rounded(velocity.y_m_s)}
         fields |= {"vz_m_s": _rounded(velocity.z_m_s), "yaw_rad_s": _rounded(velocity.yaw_rad_s)}
         fields |= {"velocity_covariance_m2_s2": _shortened(velocity.covariance_m2_s2)}
         fields |= {"yaw_sigma_rad_s": _rounded(velocity.yaw_sigma_rad_s)}
+        fields |= {"angular_rad_s": _rounded_all(velocity.angular_rad_s)}
     fields |= {"covariance_m2": _shortened(pose.covariance_m2)}
     fields |= {"heading_sigma_rad": _rounded(pose.heading_sigma_rad)}
+    fields |= {"pose_covariance": _shortened(pose.covariance)}
     if track.cameras:
         fields["cameras"] = list(track.cameras)
     present = {name: value for name, value in fields.items() if value is not None}
@@ -58,13 +61,17 @@ def encode_pose(pose: StreamPose, key: bytes | None = None) -> bytes:
     return body + b"\n" + hmac.new(key, body, hashlib.sha256).hexdigest().encode()
 
 
-def _shortened(covariance: Mat33 | None) -> list[float] | None:
-    """Return the 9 numbers of a covariance with 4 digits, row by row."""
+def _shortened(covariance: Array | None) -> list[float] | None:
+    """Return the numbers of a covariance with 4 digits, row by row."""
     return None if covariance is None else [float(f"{value:.4g}") for value in covariance.ravel().tolist()]
 
 
 def _rounded(value: float | None) -> float | None:
     return None if value is None else round(value, _DECIMALS)
+
+
+def _rounded_all(values: Iterable[float] | None) -> list[float] | None:
+    return None if values is None else [round(float(value), _DECIMALS) for value in values]
 
 
 def read_key(path: Path) -> bytes:

@@ -111,17 +111,14 @@ class VrpnStream:
             sock.close()
 
     def _send(self, pose: StreamPose) -> None:
-        heading_rad = pose.track.heading_rad
-        if not pose.is_good or heading_rad is None or not 0 <= pose.time_ns < 2**32 * NS_PER_S:
+        if not pose.is_sendable or not 0 <= pose.time_ns < 2**32 * NS_PER_S:
             return
         with self._lock:
             sender = self._sender(pose.track.robot)
             if sender is None:
                 return
             for client in self._clients:
-                if client.is_greeted and not client.send(
-                    pack_pose(pose, heading_rad, sender, client.count(2))
-                ):
+                if client.is_greeted and not client.send(pack_pose(pose, sender, client.count(2))):
                     self.drops.add(f"client {client.name} is too slow")
             waiting = any(client.has_output for client in self._clients)
         if waiting:

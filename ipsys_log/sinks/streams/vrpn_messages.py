@@ -6,11 +6,11 @@ All numbers are big-endian. Each side numbers its own senders and types, and des
 """
 
 import struct
-from math import cos, sin
 from typing import NamedTuple
 
 from ipsys_log.sinks.streams.poses import StreamPose, Velocity
 from ipsys_log.units import NS_PER_S
+from ipsys_log.vision.poses import vector_quaternion
 
 _ALIGNMENT = 8
 _HEADER = struct.Struct(">IIIiiI")
@@ -69,13 +69,13 @@ def describe(name: bytes, number: int, is_sender: bool, count: int) -> bytes:
     return pack(content, SENDER_DESCRIPTION if is_sender else TYPE_DESCRIPTION, number, 0, count)
 
 
-def pack_pose(pose: StreamPose, heading_rad: float, sender: int, count: int) -> bytes:
-    """Return the messages of a pose with a heading: the pose, and the velocity if it is known.
+def pack_pose(pose: StreamPose, sender: int, count: int) -> bytes:
+    """Return the messages of a pose with a rotation: the pose, and the velocity if it is known.
 
     The world has z up, x and y on the floor; lengths are in m.
     """
     track, velocity = pose.track, pose.velocity
-    content = _POSE.pack(_SENSOR, 0, track.x_m, track.y_m, track.z_m, *_about_z(heading_rad))
+    content = _POSE.pack(_SENSOR, 0, track.x_m, track.y_m, track.z_m, *pose.quaternion)
     message = pack(content, _POS_QUAT, sender, pose.time_ns, count)
     if velocity is None or velocity.yaw_rad_s is None:
         return message
@@ -83,13 +83,8 @@ def pack_pose(pose: StreamPose, heading_rad: float, sender: int, count: int) -> 
 
 
 def _velocity(velocity: Velocity) -> bytes:
-    turn = _about_z((velocity.yaw_rad_s or 0.0) * _TURN_S)
+    turn = vector_quaternion(velocity.turn_rad_s * _TURN_S)
     return _VELOCITY.pack(_SENSOR, 0, velocity.x_m_s, velocity.y_m_s, velocity.z_m_s, *turn, _TURN_S)
-
-
-def _about_z(angle_rad: float) -> tuple[float, float, float, float]:
-    """Return the quaternion (x, y, z, w) of a rotation about the vertical axis."""
-    return 0.0, 0.0, sin(angle_rad / 2), cos(angle_rad / 2)
 
 
 def take_message(buffer: bytearray) -> Received | None:

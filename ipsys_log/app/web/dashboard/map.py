@@ -15,6 +15,7 @@ from ipsys_log.messages import Array, CameraCalibration, Model, Rig, Track, Trac
 from ipsys_log.sinks.video.floor_map import covariance_ellipse
 from ipsys_log.statistics.floor_cameras import outline_view, read_floor_cameras
 from ipsys_log.units import NS_PER_S
+from ipsys_log.vision.bodies import track_tilt_rad
 
 _FLOOR_DECIMALS = 3  # of m
 # Margin of the map around its content, without a known floor.
@@ -158,6 +159,8 @@ class Robots:
             row["colour"] = self._colours.setdefault(track.robot, robot_colour(len(self._colours)))
         if track.heading_rad is not None and math.isfinite(track.heading_rad):
             row["heading"] = round(track.heading_rad, _DECIMALS)
+        if track.rotation_rad is not None and math.isfinite(tilt_rad := track_tilt_rad(track)):
+            row |= {"z": round(track.z_m, _DECIMALS), "tilt": round(tilt_rad, _DECIMALS)}
         if track.covariance_m2 is not None and np.isfinite(track.covariance_m2[:2, :2]).all():
             ellipse = covariance_ellipse(track.covariance_m2[:2, :2])
             row["ellipse"] = [round(value, _DECIMALS + 1) for value in ellipse]

@@ -16,14 +16,16 @@ export function showRobots(data) {
     return;
   }
   robotsShown = performance.now();
+  const degrees = (angle) => (angle === undefined ? "–" : `${Math.round((angle * 180) / Math.PI)}°`);
+  const tilts = data.robots.some((robot) => robot.colour && robot.tilt !== undefined);
   const rows = data.robots.filter((robot) => robot.colour).sort((a, b) => a.id - b.id).map((robot) => {
     const unseen = Math.max(data.now - robot.seen, 0);
-    return [`${robot.id} ${robot.name}`, robot.x.toFixed(2), robot.y.toFixed(2),
-      robot.heading === undefined ? "–" : `${Math.round((robot.heading * 180) / Math.PI)}°`,
+    return [`${robot.id} ${robot.name}`, robot.x.toFixed(2), robot.y.toFixed(2), ...(tilts ? [robot.z?.toFixed(2) ?? "–"] : []),
+      degrees(robot.heading), ...(tilts ? [degrees(robot.tilt)] : []),
       robot.ellipse ? (robot.ellipse[0] * 1000).toFixed(0) : "–",
       unseen > 1000 ? [`${Math.round(unseen / 1000)} s ago`, "bad"] : robot.outside ? ["outside", "warn"] : robot.cameras.join(", ") || "predicted"];
   });
-  table($("robots"), ["robot", "x / m", "y / m", "heading", "± / mm", "seen by"], rows, "No robot is seen yet.");
+  table($("robots"), ["robot", ...(tilts ? ["x", "y", "z / m", "heading", "tilt"] : ["x / m", "y / m", "heading"]), "± / mm", "seen by"], rows, "No robot is seen yet.");
 }
 
 export function showStatus(data) {

@@ -105,7 +105,8 @@ batch check part.mcap --workers 1
 _HELP = """
 setup, cameras, calibrate, align, record, measure, calibrate-lab, live, exclude, drift, merge, latency, pack,
 score, node, import imsel, import images, import videos, import ros, import truth, import detections,
-import pairs, batch replay, batch evaluate, batch verify, batch export, compare
+import pairs, batch replay, batch evaluate, batch verify, batch export, compare,
+calibrate-body
 """
 # Runs each command of the standard input in this process, and prints those that fail.
 _DRIVER = """

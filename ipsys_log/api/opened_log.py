@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from ipsys_log.api.compared_estimates import ComparedEstimates
+    from ipsys_log.calibration.joint.body_calibration import BodyCalibration
     from ipsys_log.tools.soundness.finding import LogCheck
 
 _STATISTICS = ("count", "rmse_m", "mean_m", "median_m", "std_m", "max_m", "p95_m")
@@ -288,6 +289,14 @@ class Log:
         names = (robot,) if isinstance(robot, str) else tuple(robot)
         options = CompareOptions(names, run and model_run(run), known, topic)
         return compare_estimates(self._session, [Path(path) for path in estimates], options)
+
+    def calibrate_body(self, robot: str, rig: StrPath | None = None) -> BodyCalibration:
+        """Estimate the poses and sides of a body's markers, as ``ipsys calibrate-body``; write nothing."""
+        from ipsys_log.messages.rig_file import load_rig
+        from ipsys_log.tools.carried_body import calibrate_carried_body
+
+        given = load_rig(Path(rig)) if rig else None
+        return calibrate_carried_body(self._session, robot, given)[0]
 
     def export(
         self,

@@ -98,6 +98,7 @@ POSITIONS = Channel(name="positions", topic="/runs/{run}/cameras/{camera}/positi
 TRACKS = Channel(name="tracks", topic="/runs/{run}/tracks", payloads=(Tracks,))
 SMOOTHED_TRACKS = Channel(name="smoothed_tracks", topic="/runs/{run}/smoothed_tracks", payloads=(Tracks,))
 ESTIMATE = Channel(name="estimate", topic="/runs/{run}/estimate", payloads=(Tracks,))
+CALIBRATED_RIG = Channel(name="calibrated_rig", topic="/runs/{run}/rig", payloads=(Rig,), lasting=True)
 POSES = Channel(name="poses", topic="/runs/{run}/poses", payloads=(FrameTransforms,))
 # The only channel that several stages of a run write.
 RUN_EVENTS = Channel(name="run_events", topic="/runs/{run}/events", payloads=(Event,))
@@ -105,7 +106,7 @@ RUN_EVENTS = Channel(name="run_events", topic="/runs/{run}/events", payloads=(Ev
 CHANNELS: tuple[Channel, ...] = (
     *(RIG, IMAGES, CALIBRATIONS, CLOCKS, MEASUREMENTS, EVENTS, LATENCY, TRUTH, PATHS, COMMANDS, CUTS, MERGES),
     *(RECORD, MARKERS, ANNOTATIONS, CAMERA_POINTS, MODEL, EVALUATION, POSITIONS, TRACKS, POSES),
-    *(SMOOTHED_TRACKS, ESTIMATE, RUN_EVENTS),
+    *(SMOOTHED_TRACKS, ESTIMATE, CALIBRATED_RIG, RUN_EVENTS),
 )
 
 RIG_TOPIC = RIG.topic

@@ -136,7 +136,7 @@ def select(session: Session, options: CutOptions) -> Selection:
     """
     cameras = _cameras(session)
     _check_names(session, options, cameras)
-    start_ns, end_ns = _time_range(session, options)
+    start_ns, end_ns = time_range(session, options)
     topics = sorted({topic for reader in session.readers for topic in reader.channels})
     rule = _TopicRule(options, cameras, _lasting_topics(session), _with_inputs(session, options.runs))
     selection = Selection(start_ns, end_ns, {topic: rule(topic) for topic in topics}, cameras)
@@ -288,7 +288,8 @@ def _listed(names: Sequence[str]) -> str:
     return text if more <= 0 else f"{text} and {more} more"
 
 
-def _time_range(session: Session, options: CutOptions) -> tuple[int, int]:
+def time_range(session: Session, options: CutOptions) -> tuple[int, int]:
+    """Return the range of log times of a part; the end is not included."""
     first_ns, last_ns = session.start_ns, session.end_ns
     start_ns = _parse_time(options.start, "--start", first_ns) if options.start else first_ns
     end_ns = _parse_time(options.end, "--end", first_ns) if options.end else last_ns + 1

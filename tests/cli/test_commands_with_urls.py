@@ -55,6 +55,7 @@ WRITE_NEW_FILES = (
     "align LOG -o U",
     "batch export LOG -o U",
     "batch replay LOG -o U",
+    "calibrate-body LOG -o U",
     "calibrate-lab LOG -o U",
     "catalogue . -o U",
     "compare LOG -o U",
@@ -69,6 +70,7 @@ WRITE_NEW_FILES = (
 )
 READ_LOGS = (
     "align U",
+    "calibrate-body U",
     "calibrate-lab U",
     "cat U",
     "compare U",

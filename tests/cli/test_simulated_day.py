@@ -222,6 +222,6 @@ def test_every_command_of_the_first_day_works_without_hardware(day: Day) -> None
     day("simulate", "-o", "s.mcap", *(word for setting in settings for word in ("--set", setting)))
     day("check", "s.mcap")
     day("catalogue", ".", "-o", "catalogue.parquet")
-    # These have tests of their own: a page, public data, weeks of logs, odometry, robots, workers, and nodes.
-    day.commands |= {"setup", "import", "drift", "compare", "drive", "batch", "node"}
+    # These have tests of their own: a page, public data, weeks of logs, odometry, bodies, robots and hosts.
+    day.commands |= {"setup", "import", "drift", "compare", "calibrate-body", "drive", "batch", "node"}
     assert day.commands == {name for names in panels().values() for name in names}

@@ -58,7 +58,7 @@ _FIRST: dict[str, dict[str, str]] = {
 }
 # Each of these groups has one line there.
 _FURTHER: dict[str, tuple[str, ...]] = {
-    "Accuracy": ("exclude", "drift", "compare"),
+    "Accuracy": ("exclude", "drift", "compare", "calibrate-body"),
     "Logs": ("check", "cat", "stream", "cut", "merge", "verify", "repair"),
     "Datasets": ("catalogue", "pack", "score"),
     "Other hosts": ("node",),
@@ -69,6 +69,7 @@ _FURTHER: dict[str, tuple[str, ...]] = {
 _MODULES: dict[str, tuple[str, ...]] = {
     "batch": ("batch",),
     "calibrate": ("calibrate",),
+    "calibrate_body": ("calibrate-body",),
     "calibrate_lab": ("calibrate-lab",),
     "compare": ("compare",),
     "camera_poses": ("align", "drift"),

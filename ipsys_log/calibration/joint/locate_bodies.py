@@ -93,11 +93,11 @@ def locate_bodies(model: JointModel, seen: BodySightings) -> BodyPoses:
     model : the calibrated camera.
     seen : the sightings of b bodies, each with the same number of markers.
     """
-    points_m, turns = _candidates(model, seen)
+    points_m, turns = body_candidates(model, seen)
     rounds, row = _Rounds(model, seen, points_m[:, :1], turns[:, :1]), np.arange(len(points_m))
     costs = rounds.look(points_m, turns).chi2 + _tilt_cost(turns)
     first = costs.argmin(axis=1)
-    apart = _angles(turns, turns[row, first][:, None])
+    apart = angles_between(turns, turns[row, first][:, None])
     second = np.where(apart < _SAME_RAD, np.inf, costs).argmin(axis=1)
     two = np.stack([first, second], axis=1)
     now = rounds.refine(points_m[row[:, None], two], turns[row[:, None], two])
@@ -163,28 +163,9 @@ class _Rounds:
         """Return the slopes (b, c, 8 k, 6) of the corners by the twist of the body."""
         arms_m = self._seen.corners_m[:, None] @ now.turns[:, :, None].swapaxes(-1, -2)
         by_corner = now.by_pose[..., :3].reshape(*arms_m.shape[:-1], 2, 3)
-        return np.asarray((by_corner @ self._motion(arms_m)).reshape(now.by_pose.shape))
-
-    def _motion(self, arms_m: Array) -> Array:
-        """Return the motion of corners (b, c, k, 4, 3, 6) by the twist, until their exposures.
-
-        ``arms_m`` (b, c, k, 4, 3) are the vectors from the origin of the body to the corners.
-        """
-        times_s = self._seen.times_s[:, None, :, :, None, None]
-        moved = np.concatenate([np.broadcast_to(np.eye(3), (*arms_m.shape, 3)), -_skew(arms_m)], axis=-1)
-        if not self._seen.at_one_instant:
-            return np.asarray(times_s * moved)
-        # The motion at the mean time of the marker, and that out of its plane from there to the row.
-        middle_m = arms_m.mean(axis=3, keepdims=True)
-        normal = cross(arms_m[..., 1, :] - arms_m[..., 0, :], arms_m[..., 0, :] - arms_m[..., 3, :])
-        normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-        out = normal[..., None, :, None] * normal[..., None, None, :]
-        tilt = -_skew(arms_m - middle_m) @ (np.eye(3) - out)
-        out_of_plane = np.concatenate(
-            [np.broadcast_to(out, tilt.shape), -out @ _skew(middle_m) + tilt], axis=-1
-        )
-        middle_s = times_s.mean(axis=3, keepdims=True)
-        return np.asarray(middle_s * moved + (times_s - middle_s) * out_of_plane)
+        times_s = self._seen.times_s[:, None]
+        motion = corner_motion(arms_m, times_s, at_one_instant=self._seen.at_one_instant)
+        return np.asarray((by_corner @ motion).reshape(now.by_pose.shape))
 
     def refine(self, points_m: Array, turns: Array) -> _Look:
         """Return candidates after Levenberg-Marquardt steps."""
@@ -228,6 +209,27 @@ class _Rounds:
         )
 
 
+def corner_motion(arms_m: Array, times_s: Array, at_one_instant: bool) -> Array:
+    """Return the motion of corners (..., 4, 3, 6) by the twist of their body, until their exposures.
+
+    ``arms_m`` (..., 4, 3) are the vectors from the origin of the body to the corners of markers. For
+    ``times_s`` (..., 4) and ``at_one_instant``, see :class:`BodySightings`.
+    """
+    times_s = times_s[..., None, None]
+    moved = np.concatenate([np.broadcast_to(np.eye(3), (*arms_m.shape, 3)), -_skew(arms_m)], axis=-1)
+    if not at_one_instant:
+        return np.asarray(times_s * moved)
+    # The motion at the mean time of the marker, and that out of its plane from there to the row.
+    middle_m = arms_m.mean(axis=-2, keepdims=True)
+    normal = cross(arms_m[..., 1, :] - arms_m[..., 0, :], arms_m[..., 0, :] - arms_m[..., 3, :])
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    out = normal[..., None, :, None] * normal[..., None, None, :]
+    tilt = -_skew(arms_m - middle_m) @ (np.eye(3) - out)
+    out_of_plane = np.concatenate([np.broadcast_to(out, tilt.shape), -out @ _skew(middle_m) + tilt], axis=-1)
+    middle_s = times_s.mean(axis=-3, keepdims=True)
+    return np.asarray(middle_s * moved + (times_s - middle_s) * out_of_plane)
+
+
 def _step(now: _Look, variances: Array) -> tuple[Array, Array, Array]:
     """Return changes (b, 6), covariances and gains (b, 6, 8 k), by variances (b, 8 k, 8 k) of the corners."""
     across = now.by_pose.swapaxes(1, 2) @ np.linalg.inv(variances)
@@ -248,7 +250,7 @@ def _choose(better: Mask, tried: _Look, now: _Look) -> _Look:
     return _Look(*(pick(new, old) for new, old in zip(tried, now, strict=True)))
 
 
-def _candidates(model: JointModel, seen: BodySightings) -> tuple[Array, Array]:
+def body_candidates(model: JointModel, seen: BodySightings) -> tuple[Array, Array]:
     """Return the poses (b, 2 k, 3), (b, 2 k, 3, 3) of bodies by both poses of each of their markers."""
     count, markers = seen.corners_px.shape[:2]
     corners_px = seen.corners_px.reshape(-1, 4, 2)
@@ -276,7 +278,7 @@ def _tilt_cost(turns: Array) -> Array:
     return np.asarray(2 * (1 - turns[..., 2, 2]) / _TILT_RAD**2)
 
 
-def _angles(first: Array, second: Array) -> Array:
+def angles_between(first: Array, second: Array) -> Array:
     """Return the angles (...) between rotations (..., 3, 3)."""
     traces = (first * second).sum(axis=(-1, -2))
     return np.asarray(np.arccos(np.clip((traces - 1) / 2, -1.0, 1.0)))

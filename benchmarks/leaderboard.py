@@ -1,23 +1,30 @@
-"""Errors of all models on published datasets, in one table.
+"""Errors of all models, or of estimates of robots, on published datasets, in one table.
 
     python benchmarks/leaderboard.py paper.zip lab/
+    python benchmarks/leaderboard.py monday.zip lab/ --estimates wheels/ orb_slam/
     python benchmarks/leaderboard.py paper.zip lab/ --own mine.py:Estimator --markdown
 
 Each dataset of ``ipsys pack`` is scored again, as ``ipsys score`` does. A cell is the mean error in mm, and
 ≠ marks scores that do not come out as stated. The first row has the lowest mean rank over the datasets.
 The errors of a dataset are cross-validated and in 3D, if all of its models have such errors.
+
+The folder of an odometry or SLAM has a file for each drive, with the name of its dataset: ``monday.tum``.
+Estimates that a dataset has are rows, too. A cell is the ATE (RMSE) in mm, after yaw and translation,
+against the tracks of the model with the smallest stated error.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
+import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import ipsys_log as ipsys
 from ipsys_log.app.report.advice import HEIGHT_NOTE, label
 from ipsys_log.app.report.pack_scores import ranked_scores
+from ipsys_log.tools.publish.opened_pack import copy_pack, fetch_pack
 
 __all__ = ["leaderboard", "table_lines"]
 
@@ -33,6 +40,23 @@ def dataset_scores(path: str, own: Sequence[str]) -> dict[str, tuple[float, bool
     computed = [one.computed for one in stated.comparisons if one.computed is not None]
     ranked = ranked_scores((*computed, *of_user))
     return {score.model: (score.mean_mm, score.model not in wrong) for score in ranked}
+
+
+def estimate_scores(path: str, name: str, folders: Sequence[Path]) -> dict[str, tuple[float, bool]]:
+    """Return by folder, or by stored run, the ATE in mm of the estimates of a drive."""
+    scores: dict[str, list[float]] = {}
+    with tempfile.TemporaryDirectory() as temporary:
+        folder, results = Path(temporary, "pack"), Path(temporary, "results.mcap")
+        folder.mkdir()
+        opened = copy_pack(fetch_pack(path, Path(temporary)), folder)
+        ipsys.replay(*opened.logs, model=ranked_scores(opened.stated.scores)[0].model, output=results)
+        with ipsys.open(*opened.logs, results) as log:
+            for row in log.compare().estimates.to_dict("records"):
+                scores.setdefault(row["run"], []).append(row["ate_m"])
+            for folder in folders:
+                if files := sorted(folder.glob(f"{name}.*")):
+                    scores[folder.name] = log.compare(*files).estimates["ate_m"].tolist()
+    return {method: (1000 * sum(ates_m) / len(ates_m), True) for method, ates_m in scores.items()}
 
 
 def leaderboard(datasets: Mapping[str, Mapping[str, tuple[float, bool]]]) -> list[tuple[str, ...]]:
@@ -97,16 +121,36 @@ def main() -> None:
     parser.add_argument(
         "--own", action="append", default=[], metavar="FILE.py:CLASS", help="a model of yours"
     )
+    parser.add_argument(
+        "--estimates",
+        nargs="*",
+        type=Path,
+        metavar="FOLDER",
+        help="score estimates, those of the datasets and these",
+    )
     parser.add_argument("--markdown", action="store_true", help="print a table in Markdown")
     options = parser.parse_args()
     scores: dict[str, dict[str, tuple[float, bool]]] = {}
     try:
         for path in options.datasets:
-            scores[_name(path, scores)] = dataset_scores(path, options.own)
+            name = _name(path, scores)
+            is_estimate = options.estimates is not None
+            scores[name] = (
+                estimate_scores(path, name, options.estimates)
+                if is_estimate
+                else dataset_scores(path, options.own)
+            )
     except ipsys.IpsysError as error:
         sys.exit(str(error))
     rows = leaderboard(scores)
-    print(*table_lines(("model", "mean rank", *scores), rows, options.markdown), sep="\n")
+    print(
+        *table_lines(
+            ("model" if options.estimates is None else "estimate", "mean rank", *scores),
+            rows,
+            options.markdown,
+        ),
+        sep="\n",
+    )
     notes = {
         HEIGHT_NOTE: any(row[0].endswith("*") for row in rows),
         f"{_DIFFERS} does not come out as stated": any(_DIFFERS in cell for row in rows for cell in row[2:]),

@@ -57,6 +57,7 @@ _UNITS = {
     "pivot mm": 1e3,
     "rotation deg": 57.296,
     "body turn deg": 57.296,
+    "scale %": 1e2,
 }
 
 
@@ -84,6 +85,7 @@ def _errors(found: PathAlignment, truth: OtherSystem) -> Row:
         "pivot mm": ((body.pivot_m - truth.pivot_m)[:2], body.pivot_sigmas_m[:2]),
         "rotation deg": (turn[free], found.turn_sigmas_rad[free]),
         "body turn deg": (wrap(np.array([body.turn_rad - truth.turn_rad])), [body.turn_sigma_rad]),
+        "scale %": ([found.scale - 1], [found.scale_sigma]),
     }
     return {name: (np.column_stack(pair) * _UNITS[name]).tolist() for name, pair in errors.items()}
 

@@ -54,4 +54,4 @@ def _errors(one: Comparison) -> Iterator[dict[str, Any]]:
         floor_m = None if row.floor is None else root_mean_square_m(row.floor)
         rest = {"rmse_m": root_mean_square_m(row.space), "rmse_2d_m": floor_m}
         known = {name: value for name, value in asdict(row.space).items() if value is not None}
-        yield names | kind | known | rest | {"heading_rmse_rad": row.heading_rmse_rad}
+        yield names | kind | known | rest | {f"{one.score.turn}_rmse_rad": row.rotation_rmse_rad}

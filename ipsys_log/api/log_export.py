@@ -8,9 +8,14 @@ from typing import NamedTuple
 
 from ipsys_log.engine.request import Progress
 from ipsys_log.errors import IpsysError
+from ipsys_log.exchange.export import TRAJECTORIES
 from ipsys_log.extras import check_installed
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages.channels import CAMERA_POINTS, CHANNELS, MARKERS, TRACKS, Channel
+from ipsys_log.messages import TRUTH_TOPIC
+from ipsys_log.messages.channels import CAMERA_POINTS, CHANNELS, ESTIMATE, MARKERS, TRACKS, Channel
+from ipsys_log.plain_text import join_names
+from ipsys_log.statistics.ground_truth import PosePairs, gather_paths, pose_pairs
+from ipsys_log.tools.comparison import read_comparisons
 
 
 class Export(NamedTuple):
@@ -35,6 +40,7 @@ class ExportOptions:
     robot : only this robot.
     with_images : put the images into a bag.
     rate_hz, size_px : frames per second, and width and height, of a video.
+    trim : write a trajectory and its ground truth, both at the instants that both have.
     """
 
     table: str = TRACKS.name
@@ -42,6 +48,7 @@ class ExportOptions:
     with_images: bool = True
     rate_hz: float = 25.0
     size_px: tuple[int, int] = (1280, 720)
+    trim: bool = False
 
 
 Runs = Sequence[str | None]
@@ -50,10 +57,34 @@ Runs = Sequence[str | None]
 def _write_table(
     session: Session, runs: Runs, path: Path, options: ExportOptions, _: Progress
 ) -> tuple[int, str]:
-    from ipsys_log.exchange.export import export_file
+    from ipsys_log.exchange.export import export_file, export_pairs
 
+    if options.trim:
+        rows, true_path = export_pairs(_pose_pairs(session, runs[0], path, options), path)
+        return rows, f"poses of {options.table}, and {true_path} with their ground truth"
     rows = export_file(session, options.table, runs, path, options.robot)
     return rows, f"rows of {options.table}"
+
+
+def _pose_pairs(session: Session, run: str | None, path: Path, options: ExportOptions) -> PosePairs:
+    """Return the poses of a robot in a run with the true ones: the tracks are those of an estimate."""
+    found: dict[str, PosePairs] = {}
+    if options.table == ESTIMATE.name:
+        found = {one.robot: one.score.pairs for one in read_comparisons(session) if one.record.run == run}
+    elif options.table == TRACKS.name:
+        true, tracks = (
+            {one.robot: one for one in gather_paths(session.messages(topics)).values()}
+            for topics in ([TRUTH_TOPIC], session.topics(TRACKS, run))
+        )
+        found = {name: pose_pairs(path, true[name]) for name, path in tracks.items() if name in true}
+    names = [name for name in sorted(found) if options.robot in (None, name)]
+    if len(names) != 1:
+        raise IpsysError(
+            f"{path}: --trim needs one robot with {TRACKS.name} and a ground truth, or with an "
+            f"{ESTIMATE.name}; choose it with --table and --robot (in {options.table} of run {run}: "
+            f"{join_names(sorted(found)) or 'none'})"
+        )
+    return found[names[0]]
 
 
 def _write_bag(
@@ -115,6 +146,8 @@ class ExportFormat:
         """
         for library in self.libraries:
             check_installed(f"{self.text} needs", library)
+        if options.trim and (self.suffix not in TRAJECTORIES or len(runs) > 1):
+            raise IpsysError(f"{path}: --trim needs one run, and a name in {' or '.join(TRAJECTORIES)}")
         if self.channel is None:
             return
         if options.table != TRACKS.name:

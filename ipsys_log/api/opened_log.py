@@ -309,6 +309,7 @@ class Log:
         with_images: bool = True,
         rate_hz: float = 25.0,
         size_px: tuple[int, int] = (1280, 720),
+        trim: bool = False,
         progress: Progress = lambda step, done, total: None,
     ) -> Export:
         """Write a channel, or the whole log, to a file for other programs.
@@ -322,6 +323,7 @@ class Log:
         format : ``csv``, ``parquet``, ``tum``, ``kitti``, ``ros2``, ``mp4`` or ``coco``; None: by the suffix.
         with_images : put the images into a bag.
         rate_hz, size_px : frames per second, and width and height, of a video.
+        trim : write a trajectory, and its ground truth with ``_truth`` in the name, at the same instants.
         progress : called with the step, the number of messages done, and the number of all messages.
 
         Raises
@@ -334,7 +336,7 @@ class Log:
         if is_one_of(file, self.paths):
             raise IpsysError(f"{file}: this is the log itself; name another file")
         found = find_format(file, format)
-        options = ExportOptions(table, robot, with_images, rate_hz, size_px)
+        options = ExportOptions(table, robot, with_images, rate_hz, size_px, trim)
         wanted = [run] if run is None or isinstance(run, str) else list(run)
         found.check(file, options, wanted)
         channel = found.channel or channel_of_table(table)

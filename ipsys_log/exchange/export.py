@@ -22,6 +22,8 @@ from ipsys_log.vision.bodies import track_quaternion, track_rotation
 if TYPE_CHECKING:
     import pandas as pd
 
+    from ipsys_log.statistics.ground_truth import PosePairs
+
 # Formats of tables, by the suffix of the file.
 FORMATS = {".csv": "csv", ".parquet": "parquet"}
 # Formats of trajectories, by the suffix of the file.
@@ -157,6 +159,45 @@ def _arrow_type(name: str, dtype: str) -> Any:
     if dtype in ("boolean", "bool"):
         return pa.bool_()
     return pa.float64() if dtype == "float64" else pa.int64() if dtype in ("int64", "Int64") else pa.string()
+
+
+def export_pairs(pairs: PosePairs, path: Path) -> tuple[int, Path]:
+    """Write poses and, into a second file, the true ones at the same instants; return their number.
+
+    Parameters
+    ----------
+    path : of the new file; its suffix is one of ``TRAJECTORIES``. The name of the second one, which is
+        returned, ends in ``_truth``.
+
+    Raises
+    ------
+    IpsysError
+        No pose has a rotation in both.
+    """
+    # Late: most commands rotate nothing, and scipy takes long to load.
+    from scipy.spatial.transform import Rotation
+
+    known = pairs.part(pairs.is_turned)
+    true_path = path.with_stem(f"{path.stem}_truth")
+    if not len(known.times_ns):
+        raise IpsysError(
+            f"{path}: no pose has a heading and a ground truth; export the table as .csv instead"
+        )
+    for file_path, points_m, axes in (
+        (path, known.points_m, known.axes),
+        (true_path, known.true_m, known.true_axes),
+    ):
+        rows = np.concatenate([points_m, Rotation.from_matrix(axes).as_quat()], axis=1)
+        starts = [f"{t // NS_PER_S}.{t % NS_PER_S:09d} " for t in known.times_ns.tolist()]
+        if path.suffix.lower() == ".kitti":
+            rows = np.concatenate([axes, points_m[:, :, None]], axis=2).reshape(-1, 12)
+            starts = [""] * len(rows)
+        lines = [
+            f"{start}{' '.join(map(repr, row))}\n" for start, row in zip(starts, rows.tolist(), strict=True)
+        ]
+        with replacement_of(file_path) as file:
+            file.write("".join(lines).encode())
+    return len(known.times_ns), true_path
 
 
 def export_trajectory(session: Session, name: str, run: str | None, path: Path, robot: str | None) -> int:

@@ -1,8 +1,7 @@
 """Import of ground truth from another system: its clock and coordinates become those of the lab."""
 
-import re
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,17 +19,14 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages import IMPORTED, RIG_TOPIC, TRUTH_TOPIC, Message, Rig, Run, Track, Tracks
 from ipsys_log.messages.channels import RIG, TRACKS, TRUTH
 from ipsys_log.messages.rig_file import check_robots
-from ipsys_log.statistics.ground_truth import LONGEST_GAP_NS, TrackedPath, gather_paths, last_poses
-from ipsys_log.statistics.path_alignment import (
-    PathAlignment,
-    Residuals,
-    align_trajectories,
-)
+from ipsys_log.statistics.ground_truth import LONGEST_GAP_NS, TrackedPath, about_z, gather_paths, last_poses
+from ipsys_log.statistics.path_alignment import PathAlignment, Residuals, align_trajectories, seconds_text
 from ipsys_log.statistics.path_cleaning import select_rows
 from ipsys_log.statistics.path_pairs import PathPair, common_instants
 from ipsys_log.statistics.path_problem import ALIGNMENTS
 from ipsys_log.statistics.trajectories import KnownParts, Trajectory, TrajectoryPair
 from ipsys_log.units import NS_PER_S, format_time
+from ipsys_log.vision.poses import rotation_vector
 from ipsys_log.vision.time_brackets import bracket_times
 
 _RUN = "truth"
@@ -124,7 +120,8 @@ def import_truth(
         tracks = _tracks(session, run, ids)
         fitted = _fit(paths, tracks, options, session, run, where)
         record = _record(files, options, fitted, session, run if tracks else None)
-        messages = list(_messages(fitted, ids, where))
+        tilted = {body.robot for body in rig.bodies if not body.level}
+        messages = list(_messages(fitted, ids, tilted, where))
         last_ns = messages[-1].log_time_ns
         record = replace(record, timestamp=last_ns)
         if session is None:  # a new log: its rig comes first
@@ -262,16 +259,13 @@ def _marker_poses(alignment: PathAlignment, number: int, track: TrackedPath) -> 
     from scipy.spatial.transform import Rotation
 
     poses, body = alignment.poses[number], alignment.bodies[number]
-    is_turned = np.asarray(np.isfinite(poses.quaternions).all(axis=1))
-    quaternions, axes = np.full((len(is_turned), 4), np.nan), np.full((len(is_turned), 3, 3), np.nan)
+    axes, quaternions = poses.axes @ about_z(np.array([-body.turn_rad])), poses.quaternions.copy()
+    is_turned = np.isfinite(axes).all(axis=(1, 2))
     if is_turned.any():
-        marker = Rotation.from_quat(poses.quaternions[is_turned]) * Rotation.from_euler("z", -body.turn_rad)
-        quaternions[is_turned], axes[is_turned] = marker.as_quat(), marker.as_matrix()
+        quaternions[is_turned] = Rotation.from_matrix(axes[is_turned]).as_quat()
     brackets = bracket_times(track.positions.times_ns, poses.times_ns, LONGEST_GAP_NS)
     rest = ~is_turned & brackets.is_known
-    if rest.any():
-        by_track = brackets.mix(np.asarray(np.unwrap(np.nan_to_num(track.headings_rad))))
-        axes[rest] = Rotation.from_euler("z", by_track[rest, None]).as_matrix()
+    axes[rest] = about_z(brackets.mix(np.asarray(np.unwrap(np.nan_to_num(track.headings_rad))))[rest])
     points_m = poses.points_m - (axes @ body.pivot_m if body.pivot_m.any() else 0.0)
     known = np.asarray(np.isfinite(points_m).all(axis=1))
     return select_rows(replace(poses, points_m=points_m, quaternions=quaternions), known)
@@ -308,17 +302,19 @@ def _time(time_ns: int) -> str:
     return format_time(time_ns) if 0 <= time_ns < 1 << 63 else f"{time_ns / NS_PER_S:.3f} s"
 
 
-def _messages(fitted: _Fitted, ids: dict[str, int], where: str) -> Iterator[Message]:
-    """Yield the poses of all robots by instant."""
+def _messages(fitted: _Fitted, ids: dict[str, int], tilted: Collection[str], where: str) -> Iterator[Message]:
+    """Yield the poses of all robots by instant; those of tilted bodies have full rotations."""
     by_time: dict[int, list[Track]] = defaultdict(list)
     for path in fitted.poses:
-        x, y, z, w = path.quaternions.T
+        axes = path.axes
         # The heading is that of the x axis.
-        headings_rad = np.arctan2(2 * (x * y + z * w), 1 - 2 * (y * y + z * z)).tolist()
-        rows = zip(path.times_ns.tolist(), path.points_m.tolist(), headings_rad, strict=True)
-        for time_ns, (x_m, y_m, z_m), heading_rad in rows:
+        headings_rad = np.arctan2(axes[:, 1, 0], axes[:, 0, 0]).tolist()
+        rows = zip(path.times_ns.tolist(), path.points_m.tolist(), headings_rad, axes, strict=True)
+        for time_ns, (x_m, y_m, z_m), heading_rad, turn in rows:
             known = heading_rad if np.isfinite(heading_rad) else None
-            by_time[time_ns].append(Track(path.name, ids[path.name], x_m, y_m, z_m, known))
+            vector_rad = rotation_vector(turn) if known is not None and path.name in tilted else None
+            track = Track(path.name, ids[path.name], x_m, y_m, z_m, known, rotation_rad=vector_rad)
+            by_time[time_ns].append(track)
     if min(by_time) < 0 or max(by_time) >= 1 << 62:
         raise IpsysError(
             f"{where}: the times in the clock of the lab are before 1970 or after 2116; check --time-offset"
@@ -336,12 +332,13 @@ def _record(
         "format": " ".join(sorted({path.suffix.lower().removeprefix(".") for path in files})),
         "files": " ".join(path.name for path in files),
         "align": options.align,
-        "time_offset_s": _seconds(fitted.time_offset_ns),
-        **_numbers(fitted),
+        "time_offset_s": seconds_text(fitted.time_offset_ns),
     }
-    if fitted.alignment is not None:
-        texts = {"axes": fitted.alignment.axes, "remarks": "\n".join(fitted.alignment.remarks)}
-        parameters |= {name: text for name, text in texts.items() if text}
+    if (found := fitted.alignment) is not None:
+        parameters |= found.record_parameters([f"{robot}_" for robot in found.names])
+    if (residuals := fitted.residuals) is not None:
+        parameters |= {"rmse_2d_m": f"{residuals.rmse_2d_m:.4g}", "rmse_3d_m": f"{residuals.rmse_3d_m:.4g}"}
+        parameters |= {"instants": str(residuals.instants), "outliers": str(residuals.outliers)}
     record = Run(0, _RUN, IMPORTED, parameters, fingerprint(), number=1)
     if session is None:
         return record
@@ -352,48 +349,3 @@ def _record(
         inputs=() if run is None else read_channels(session, session.topics(TRACKS, run)),
         number=max((other.number for other in session.runs()), default=0) + 1,
     )
-
-
-def _numbers(fitted: _Fitted) -> dict[str, str]:
-    """Return the estimates with all digits, and standard deviations and residuals with a few, as texts."""
-    estimates: dict[str, float] = {}
-    errors: dict[str, float] = {}
-    if (found := fitted.alignment) is not None:
-        values = {
-            "time_offset_s": (None, found.offset_sigma_s),
-            "clock_drift": (found.drift, found.drift_sigma),
-        }
-        for axis, name in enumerate("xyz"):
-            turn, shift = found.turn_rad[axis], found.motion.shift_m[axis]
-            values[f"rotation_{name}_rad"] = turn, found.turn_sigmas_rad[axis]
-            values[f"translation_{name}_m"] = shift, found.shift_sigmas_m[axis]
-        for robot, body in zip(found.names, found.bodies, strict=True):
-            for axis, name in enumerate("xyz"):
-                values[f"{robot}_pivot_{name}_m"] = body.pivot_m[axis], body.pivot_sigmas_m[axis]
-            values[f"{robot}_body_turn_rad"] = body.turn_rad, body.turn_sigma_rad
-        for name, (value, sigma) in values.items():
-            if np.isfinite(sigma):
-                estimates |= {} if value is None else {name: float(value)}
-                errors[sigma_name(name)] = float(sigma)
-    if (residuals := fitted.residuals) is not None:
-        errors |= {"rmse_2d_m": residuals.rmse_2d_m, "rmse_3d_m": residuals.rmse_3d_m}
-        estimates |= {"instants": residuals.instants, "outliers": residuals.outliers}
-    return {name: repr(value) for name, value in estimates.items()} | {
-        name: f"{value:.4g}" for name, value in errors.items()
-    }
-
-
-def sigma_name(name: str) -> str:
-    """Return the parameter of a record with the standard deviation of another one.
-
-    Examples
-    --------
-    >>> sigma_name("pivot_x_m"), sigma_name("scale")
-    ('pivot_x_sigma_m', 'scale_sigma')
-    """
-    return re.sub(r"(_(?:m|rad|s))?$", r"_sigma\1", name, count=1)
-
-
-def _seconds(time_ns: int) -> str:
-    whole, rest = divmod(abs(time_ns), NS_PER_S)
-    return f"{'-' if time_ns < 0 else ''}{whole}.{rest:09d}"

@@ -13,8 +13,9 @@ from ipsys_log.statistics.ground_truth import (
     PosePairs,
     RelativeErrors,
     TrajectoryErrors,
+    about_z,
     relative_errors,
-    wrap_angles,
+    turns_between,
 )
 from ipsys_log.statistics.path_pairs import gap_limit_s
 from ipsys_log.units import NS_PER_S
@@ -50,8 +51,8 @@ class EstimateFrame(NamedTuple):
 class AlignedErrors(NamedTuple):
     """The absolute errors of an estimate after an alignment.
 
-    ``points_m`` (n, 3) are the aligned positions. ``turns_rad`` (n,) are the errors of the headings, NaN
-    where a heading is unknown.
+    ``points_m`` (n, 3) are the aligned positions. ``turns_rad`` (n,) are the angles of the rotation errors,
+    about the vertical for a level robot, and NaN where a rotation is unknown.
     """
 
     alignment: str
@@ -81,7 +82,7 @@ class ScoreRow(NamedTuple):
     delta: str
     space: ErrorStatistics
     floor: ErrorStatistics | None
-    heading_rmse_rad: float | None
+    rotation_rmse_rad: float | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,22 +91,31 @@ class EstimateScore:
 
     Attributes
     ----------
-    times_ns : (n,), instants of the estimate.
-    true_m : (n, 3), true positions of the origin of the body, from the tracks.
+    pairs : the poses of the estimate in its own coordinates, levelled, and the true ones of the same body,
+        from the tracks, at the instants of the estimate.
+    turn : ``heading`` of a level robot, or ``rotation``: the name of the errors of rotations.
     tracks_m : RMS of the errors that the covariances of the tracks expect, in 3D; None without covariances.
     drift : the relative errors over the distance of the drift; None for a short path.
     nees : mean normalised squared error of positions on the floor, by degree of freedom; None without
         covariances.
     """
 
-    times_ns: Times
-    true_m: Array
+    pairs: PosePairs
+    turn: str
     aligned: tuple[AlignedErrors, ...]
     relative: tuple[RelativeErrors, ...]
     tracks_m: float | None
     coverage: Coverage
     drift: RelativeErrors | None
     nees: float | None
+
+    @property
+    def times_ns(self) -> Times:
+        return self.pairs.times_ns
+
+    @property
+    def true_m(self) -> Array:
+        return self.pairs.true_m
 
     @property
     def passed_m(self) -> Array:
@@ -137,7 +147,12 @@ def _rms(errors_rad: Array | None) -> float | None:
 
 
 def score_estimate(
-    estimate: TrackRows, tracks: TrackRows, frame: EstimateFrame, with_scale: bool, where: str
+    estimate: TrackRows,
+    tracks: TrackRows,
+    frame: EstimateFrame,
+    with_scale: bool,
+    where: str,
+    rotations: tuple[Array, Array] | None = None,
 ) -> EstimateScore:
     """Score an estimate against the tracks of its robot.
 
@@ -149,6 +164,8 @@ def score_estimate(
     estimate : poses of the body in the clock and the coordinates of the lab, one after the other.
     tracks : rows of the marker, without predicted poses.
     with_scale : True to add the alignment with a scale.
+    rotations : of the body of the estimate and of the marker, to the lab, at the instants of the estimate,
+        each (n, 3, 3); None for a level robot, which has headings alone.
 
     Raises
     ------
@@ -162,25 +179,27 @@ def score_estimate(
     """
     limit_ns = gap_limit_s(tracks.times_ns / NS_PER_S) * NS_PER_S
     samples = interpolate(tracks, estimate.times_ns)
-    lever_m = _lever_m(samples.headings_rad, frame.pivot_m)
-    true_m = samples.points_m + lever_m
+    own_axes, true_axes = rotations or (about_z(estimate.headings_rad), about_z(samples.headings_rad))
+    lever_m = _lever_m(true_axes, frame.pivot_m)
     cov_m2 = samples.covariances_m2 + _turned_by(lever_m, samples.heading_sigmas_rad)
     known = bracket_times(tracks.times_ns, estimate.times_ns, limit_ns).is_known
-    known &= np.isfinite(true_m).all(axis=1)
+    known &= np.isfinite(samples.points_m + lever_m).all(axis=1)
     if known.sum() < LEAST_POSES:
         raise IpsysError(
             f"{where}: fewer than {LEAST_POSES} poses are at the times of the tracks; check --time-offset"
         )
-    own_m = (estimate.points_m - frame.shift_m) @ _about_z(frame.yaw_rad) / frame.scale
+    yaw, turn = about_z(np.array([frame.yaw_rad, frame.turn_rad]))
     pairs = PosePairs(
-        estimate.times_ns[known],
-        own_m[known],
-        wrap_angles(estimate.headings_rad[known] - frame.yaw_rad),
-        true_m[known],
-        wrap_angles(samples.headings_rad[known] + frame.turn_rad),
-    )
+        estimate.times_ns,
+        (estimate.points_m - frame.shift_m) @ yaw / frame.scale,
+        yaw.T @ own_axes,
+        samples.points_m + lever_m,
+        true_axes @ turn,
+    ).part(known)
+    is_level = rotations is None
     aligned = [
-        _aligned(pairs, kind) for kind in (NONE, FIRST_POSE, YAW, SE3, *([SIM3] if with_scale else []))
+        _aligned(pairs, kind, is_level)
+        for kind in (NONE, FIRST_POSE, YAW, SE3, *([SIM3] if with_scale else []))
     ]
     rows = tuple(row for row in aligned if row is not None)
     scaled = pairs._replace(points_m=pairs.points_m * rows[-1].scale)
@@ -189,8 +208,8 @@ def score_estimate(
     first = next((row for row in rows if row.alignment == FIRST_POSE), None)
     sigmas_rad = estimate.heading_sigmas_rad[known], samples.heading_sigmas_rad[known]
     return EstimateScore(
-        pairs.times_ns,
-        pairs.true_m,
+        pairs,
+        "heading" if is_level else "rotation",
         rows,
         tuple(relative_errors(scaled, DELTAS)),
         float(np.sqrt(variances_m2[has_variance].mean())) if has_variance.any() else None,
@@ -201,18 +220,14 @@ def score_estimate(
             first or rows[1],
             (estimate.covariances_m2[known], cov_m2[known]),
             sigmas_rad,
-            frame.yaw_rad,
+            yaw,
         ),
     )
 
 
-def _lever_m(headings_rad: Array, pivot_m: Array) -> Array:
-    """Return the vectors (n, 3) from a marker to the origin of a body, in the axes of the lab."""
-    cos, sin = (
-        (np.cos(headings_rad), np.sin(headings_rad)) if pivot_m.any() else (np.zeros(len(headings_rad)),) * 2
-    )
-    x_m, y_m, z_m = pivot_m
-    return np.column_stack([cos * x_m - sin * y_m, sin * x_m + cos * y_m, np.full(len(cos), z_m)])
+def _lever_m(axes: Array, pivot_m: Array) -> Array:
+    """Return the vectors (n, 3) from a marker with axes (n, 3, 3) to the origin of a body, in the lab."""
+    return axes @ pivot_m if pivot_m.any() else np.zeros((len(axes), 3))
 
 
 def _turned_by(lever_m: Array, sigmas_rad: Array) -> Array:
@@ -221,45 +236,38 @@ def _turned_by(lever_m: Array, sigmas_rad: Array) -> Array:
     return across_m[:, :, None] * across_m[:, None, :] * (np.nan_to_num(sigmas_rad) ** 2).reshape(-1, 1, 1)
 
 
-def _about_z(angle_rad: float) -> Array:
-    cos, sin = np.cos(angle_rad), np.sin(angle_rad)
-    return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-
-
-def _aligned(pairs: PosePairs, kind: str) -> AlignedErrors | None:
-    """Return the absolute errors after an alignment; None if no pair has the headings that it needs."""
+def _aligned(pairs: PosePairs, kind: str, is_level: bool) -> AlignedErrors | None:
+    """Return the absolute errors after an alignment; None if no pair has the rotations that it needs."""
     scale, rotation, shift_m = 1.0, np.eye(3), np.zeros(3)
     if kind == FIRST_POSE:
-        if not pairs.has_headings[0]:
+        if not pairs.is_turned[0]:
             return None
-        rotation = _about_z(pairs.true_rad[0] - pairs.headings_rad[0])
+        rotation = pairs.true_axes[0] @ pairs.axes[0].T
         shift_m = pairs.true_m[0] - rotation @ pairs.points_m[0]
     elif kind != NONE:
         scale, rotation, shift_m = _fit(pairs.points_m, pairs.true_m, kind)
     points_m = scale * pairs.points_m @ rotation.T + shift_m
-    ahead = np.column_stack([np.cos(pairs.headings_rad), np.sin(pairs.headings_rad)]) @ rotation[:2, :2].T
-    turns_rad = wrap_angles(np.arctan2(ahead[:, 1], ahead[:, 0]) - pairs.true_rad)
+    axes = rotation @ pairs.axes
+    if is_level:  # the alignment may tilt it
+        axes = about_z(np.arctan2(axes[:, 1, 0], axes[:, 0, 0]))
+    turns_rad = turns_between(axes, pairs.true_axes)
     return AlignedErrors(kind, scale, points_m, TrajectoryErrors("", points_m - pairs.true_m, ()), turns_rad)
 
 
 def _fit(points_m: Array, true_m: Array, kind: str) -> tuple[float, Array, Array]:
     """Return scale, rotation and translation with the least squared distances, from points to true ones."""
     middle_m, target_m = points_m.mean(axis=0), true_m.mean(axis=0)
-    from_m, to_m = points_m - middle_m, true_m - target_m
-    scale = 1.0
-    if kind == YAW:
-        cross = from_m[:, 0] @ to_m[:, 1] - from_m[:, 1] @ to_m[:, 0]
-        rotation = _about_z(float(np.arctan2(cross, (from_m[:, :2] * to_m[:, :2]).sum())))
-    else:
-        rotation, best = rotation_between(from_m, to_m)
-        scale = best if kind == SIM3 else 1.0
+    rotation, axes = np.eye(3), 2 if kind == YAW else 3
+    from_m, to_m = (points_m - middle_m)[:, :axes], (true_m - target_m)[:, :axes]
+    rotation[:axes, :axes], best = rotation_between(from_m, to_m)
+    scale = best if kind == SIM3 else 1.0
     return scale, rotation, target_m - scale * rotation @ middle_m
 
 
 def _coverage(times_ns: Times, tracks: TrackRows, pivot_m: Array) -> Coverage:
     limit_ns = gap_limit_s(times_ns / NS_PER_S) * NS_PER_S
     covered = bracket_times(times_ns, tracks.times_ns, limit_ns).is_known
-    places_m = tracks.points_m + _lever_m(tracks.headings_rad, pivot_m)
+    places_m = tracks.points_m + _lever_m(about_z(tracks.headings_rad), pivot_m)
     placed = np.isfinite(places_m).all(axis=1)
     cells = np.floor(places_m[:, :2] / CELL_M)
     areas = [len(np.unique(cells[mask], axis=0)) for mask in (placed & covered, placed)]
@@ -295,7 +303,7 @@ def _nees(
     row: AlignedErrors,
     covariances_m2: tuple[Array, Array],
     sigmas_rad: tuple[Array, Array],
-    yaw_rad: float,
+    yaw: Array,
 ) -> float | None:
     """Return the mean normalised squared error on the floor, by degree of freedom.
 
@@ -307,7 +315,7 @@ def _nees(
         return None
     together_m2 = np.nan_to_num(true_m2)
     if row.alignment == FIRST_POSE:
-        turn = _about_z(float(pairs.true_rad[0] - pairs.headings_rad[0] - yaw_rad))
+        turn = pairs.true_axes[0] @ pairs.axes[0].T @ yaw.T
         own_m2 = turn @ own_m2 @ turn.T
         first_rad = float(np.hypot(*(np.nan_to_num(sigmas[0]) for sigmas in sigmas_rad)))
         levers_m = pairs.true_m - pairs.true_m[0]

@@ -8,17 +8,19 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ipsys_log.messages import Array, ErrorStatistics, Indices, Mask, Message, Tracks
+from ipsys_log.messages import Array, ErrorStatistics, Indices, Mask, Message, Times, Tracks
 from ipsys_log.statistics.accuracy import error_statistics
 from ipsys_log.statistics.calibration_points import TimedPoints, still_interval
 from ipsys_log.statistics.tape import RiggedMeasurement
 from ipsys_log.units import NS_PER_S
+from ipsys_log.vision.poses import rotate
 from ipsys_log.vision.time_brackets import TimeBrackets, bracket_times
 
 _SAME_HEIGHT_M = 0.005
 # Longest gap for linear interpolation. For a robot with 2 m/s and 2.5 rad/s, its error is 0.7 mm over 1/30 s,
 # and 6 mm over 0.1 s.
 LONGEST_GAP_NS = NS_PER_S // 10
+_NO_ROTATION = (math.nan,) * 3
 
 
 class TrackErrors(NamedTuple):
@@ -42,11 +44,24 @@ class TrackErrors(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackedPath:
-    """The positions of a robot in order of time, and its headings (n,) in rad, NaN where there is none."""
+    """The positions of a robot in order of time, and its headings (n,) in rad, NaN where there is none.
+
+    ``rotations_rad`` (n, 3) are the rotation vectors of a body that is not level; None for a level one.
+    """
 
     robot: str
     positions: TimedPoints
     headings_rad: Array
+    rotations_rad: Array | None = None
+
+    def axes_at(self, times_ns: Times) -> Array:
+        """Return the rotations (k, 3, 3) to the world at times (k,); NaN in gaps and for a level robot."""
+        rows = last_poses(self.positions)
+        assert self.rotations_rad is not None
+        brackets = bracket_times(self.positions.times_ns[rows], times_ns, LONGEST_GAP_NS)
+        found = _mix_axes(brackets, rotate(self.rotations_rad[rows]))
+        found[~brackets.is_known] = np.nan
+        return found
 
 
 def gather_tracks(messages: Iterable[Message]) -> dict[int, TimedPoints]:
@@ -59,13 +74,14 @@ def gather_tracks(messages: Iterable[Message]) -> dict[int, TimedPoints]:
 
 def gather_paths(messages: Iterable[Message]) -> dict[int, TrackedPath]:
     """Return the positions of :func:`gather_tracks` with headings and the names of the robots, by marker."""
-    rows: dict[int, list[tuple[int, float, float, float, float]]] = {}
+    rows: dict[int, list[tuple[float, ...]]] = {}
     robots: dict[int, str] = {}
     for message in messages:
         if isinstance(message.payload, Tracks):
             for track in (one for one in message.payload.tracks if one.coasting_ns is None):
                 heading_rad = math.nan if track.heading_rad is None else track.heading_rad
-                row = (message.publish_time_ns, track.x_m, track.y_m, track.z_m, heading_rad)
+                turn_rad = () if track.rotation_rad is None else tuple(track.rotation_rad.tolist())
+                row = (message.publish_time_ns, track.x_m, track.y_m, track.z_m, heading_rad, *turn_rad)
                 rows.setdefault(track.id, []).append(row)
                 robots.setdefault(track.id, track.robot)
     for values in rows.values():
@@ -78,6 +94,7 @@ def gather_paths(messages: Iterable[Message]) -> dict[int, TrackedPath]:
                 np.array([row[1:4] for row in values], dtype=np.float64),
             ),
             np.array([row[4] for row in values], dtype=np.float64),
+            np.array([row[5:] or _NO_ROTATION for row in values]) if any(row[5:] for row in values) else None,
         )
         for marker_id, values in rows.items()
     }
@@ -163,8 +180,8 @@ TRANSLATION, DISTANCE = "translation_part", "point_distance"
 class RelativeErrors(NamedTuple):
     """The relative pose error over a distance or a time.
 
-    ``relation`` is ``translation_part``, which needs headings, or ``point_distance``. ``errors_m`` is (n,).
-    ``errors_rad`` (n,) are those of the rotation about z; None without headings.
+    ``relation`` is ``translation_part``, which needs rotations, or ``point_distance``. ``errors_m`` is (n,).
+    ``errors_rad`` (n,) are the angles of the rotation error; None without rotations.
     """
 
     delta: float
@@ -201,23 +218,26 @@ class TrajectoryErrors(NamedTuple):
 
 
 class PosePairs(NamedTuple):
-    """Poses of a trajectory and the true ones at the same n instants; headings (n,) are NaN where unknown."""
+    """Poses of a trajectory and the true ones at the same n instants.
+
+    ``axes`` and ``true_axes`` (n, 3, 3) are rotations, NaN where unknown. Those of a level robot are of its
+    heading.
+    """
 
     times_ns: NDArray[np.int64]
     points_m: Array
-    headings_rad: Array
+    axes: Array
     true_m: Array
-    true_rad: Array
+    true_axes: Array
 
     @property
-    def has_headings(self) -> Mask:
-        """The instants with both headings (n,)."""
-        return np.isfinite(self.headings_rad) & np.isfinite(self.true_rad)
+    def is_turned(self) -> Mask:
+        """The instants with both rotations (n,)."""
+        return np.asarray(np.isfinite(self.axes + self.true_axes).all(axis=(1, 2)))
 
     def part(self, rows: Mask | Indices) -> "PosePairs":
         """Return the pairs of some instants."""
-        others = (self.points_m, self.headings_rad, self.true_m, self.true_rad)
-        return PosePairs(self.times_ns[rows], *(values[rows] for values in others))
+        return PosePairs(self.times_ns[rows], *(values[rows] for values in self[1:]))
 
 
 def trajectory_errors(
@@ -258,27 +278,52 @@ def pool_trajectories(trajectories: Sequence[TrajectoryErrors]) -> TrajectoryErr
 
 
 def _errors_of(track: TrackedPath, truth: TrackedPath) -> TrajectoryErrors | None:
+    pairs = pose_pairs(track, truth)
+    if not len(pairs.times_ns):
+        return None
+    return TrajectoryErrors(track.robot, pairs.points_m - pairs.true_m, tuple(relative_errors(pairs)))
+
+
+def pose_pairs(track: TrackedPath, truth: TrackedPath) -> PosePairs:
+    """Return the poses of a track with a ground truth, and the true ones at the same instants."""
     rows = last_poses(track.positions)
     times_ns = track.positions.times_ns[rows]
     brackets = bracket_times(truth.positions.times_ns, times_ns, LONGEST_GAP_NS)
     is_known = brackets.is_known
-    if not is_known.any():
-        return None
     rows = rows[is_known]
-    pairs = PosePairs(
-        times_ns[is_known],
-        track.positions.points_m[rows],
-        track.headings_rad[rows],
-        brackets.mix(truth.positions.points_m)[is_known],
-        _mix_headings(brackets, truth.headings_rad)[is_known],
-    )
-    return TrajectoryErrors(track.robot, pairs.points_m - pairs.true_m, tuple(relative_errors(pairs)))
+    if track.rotations_rad is not None and truth.rotations_rad is not None:
+        axes, true_axes = rotate(track.rotations_rad[rows]), truth.axes_at(times_ns[is_known])
+    else:
+        axes, true_axes = about_z(track.headings_rad[rows]), about_z(truth.headings_rad)
+        true_axes = _mix_axes(brackets, true_axes)[is_known]
+    true_m = brackets.mix(truth.positions.points_m)[is_known]
+    return PosePairs(times_ns[is_known], track.positions.points_m[rows], axes, true_m, true_axes)
 
 
-def _mix_headings(brackets: TimeBrackets, known_rad: Array) -> Array:
-    """Return headings (k,) between those of the truth (n,), along the shorter arc; NaN if unknown."""
-    start_rad, end_rad = known_rad[brackets.before], known_rad[brackets.after]
-    return np.asarray(start_rad + brackets.share * wrap_angles(end_rad - start_rad))
+def _mix_axes(brackets: TimeBrackets, axes: Array) -> Array:
+    """Return rotations (k, 3, 3) between known ones (n, 3, 3), along the shortest turn; NaN if unknown."""
+    from scipy.spatial.transform import Rotation
+
+    start, end = axes[brackets.before], axes[brackets.after]
+    found = np.full_like(start, np.nan)
+    known = np.isfinite(start + end).all(axis=(1, 2))
+    if known.any():
+        turns = Rotation.from_matrix(start[known].swapaxes(1, 2) @ end[known]).as_rotvec()
+        found[known] = start[known] @ rotate(brackets.share[known, None] * turns)
+    return found
+
+
+def about_z(angles_rad: Array) -> Array:
+    """Return rotations (n, 3, 3) by angles (n,) about the vertical."""
+    cos, sin, none = np.cos(angles_rad), np.sin(angles_rad), 0.0 * angles_rad
+    rows = [[cos, -sin, none], [sin, cos, none], [none, none, none + 1.0]]
+    return np.moveaxis(np.array(rows), 2, 0)
+
+
+def turns_between(first: Array, second: Array) -> Array:
+    """Return the angles (n,) in rad between rotations (n, 3, 3): exact for small ones, too."""
+    sines = np.linalg.norm(first - second, axis=(1, 2)) / np.sqrt(8.0)
+    return np.asarray(2 * np.arcsin(np.minimum(sines, 1.0)))
 
 
 def wrap_angles(angles_rad: Array) -> Array:
@@ -291,11 +336,10 @@ def relative_errors(
 ) -> list[RelativeErrors]:
     """Return the relative pose errors over distances and times; none for one that no two instants have.
 
-    With headings, only the instants with a heading count. A pair is within ``share`` of a distance.
+    With rotations, only the instants with a rotation count. A pair is within ``share`` of a distance.
     """
-    has_headings = pairs.has_headings
-    if is_turned := bool(has_headings.any()):
-        pairs = pairs.part(has_headings)
+    if is_turned := bool(pairs.is_turned.any()):
+        pairs = pairs.part(pairs.is_turned)
     steps_m = np.linalg.norm(np.diff(pairs.true_m, axis=0), axis=1)
     passed = {
         "m": np.append(0.0, np.cumsum(steps_m)),
@@ -312,11 +356,10 @@ def relative_errors(
                 lengths_m = [np.linalg.norm(move_m, axis=1) for move_m in moves_m]
                 found.append(RelativeErrors(delta, unit, DISTANCE, np.abs(lengths_m[0] - lengths_m[1])))
                 continue
-            headings_rad = pairs.headings_rad, pairs.true_rad
-            own_m = [_turned_back(m, rad[start]) for m, rad in zip(moves_m, headings_rad, strict=True)]
+            back = [rows[start].swapaxes(1, 2) for rows in (pairs.axes, pairs.true_axes)]
+            own_m = [np.einsum("nij,nj->ni", turn, m) for turn, m in zip(back, moves_m, strict=True)]
             errors_m = np.linalg.norm(own_m[0] - own_m[1], axis=1)
-            turns_rad = [rad[end] - rad[start] for rad in headings_rad]
-            errors_rad = np.abs(wrap_angles(turns_rad[0] - turns_rad[1]))
+            errors_rad = turns_between(back[0] @ pairs.axes[end], back[1] @ pairs.true_axes[end])
             found.append(RelativeErrors(delta, unit, TRANSLATION, errors_m, errors_rad))
     return found
 
@@ -342,10 +385,3 @@ def pairs_at(passed: Array, delta: float, tolerance: float) -> tuple[Places, Pla
     end = np.where(misses[0] <= misses[1], below, above)
     kept = np.minimum(*misses) <= tolerance
     return start[kept], end[kept]
-
-
-def _turned_back(moves_m: Array, headings_rad: Array) -> Array:
-    """Return moves (n, 3) in the coordinates of a robot with headings (n,)."""
-    cos, sin = np.cos(headings_rad), np.sin(headings_rad)
-    x_m, y_m, z_m = moves_m.T
-    return np.column_stack([cos * x_m + sin * y_m, cos * y_m - sin * x_m, z_m])

@@ -4,8 +4,10 @@ The path of another system is either measured, such as that of motion capture: t
 field over the floor. Or it is dead-reckoned and drifts. The likelihood of its residuals tells which.
 """
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from decimal import Decimal
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -16,7 +18,7 @@ from ipsys_log.messages import Array, Mask, Times
 from ipsys_log.statistics.calibration_points import TimedPoints
 from ipsys_log.statistics.ground_truth import LONGEST_GAP_NS
 from ipsys_log.statistics.path_cleaning import REPEATED, repeated, select_rows
-from ipsys_log.statistics.path_fit import LEAST_INSTANTS, PathFit, State, linearize
+from ipsys_log.statistics.path_fit import LEAST_INSTANTS, PathFit, State, free_scale, linearize
 from ipsys_log.statistics.path_pairs import Body
 from ipsys_log.statistics.path_problem import (
     NO_AGREEMENT,
@@ -36,8 +38,9 @@ _LARGEST_PIVOT_SIGMA_M = 0.03
 # A robot that has moved this far while its pose repeats was lost.
 _LOST_M = 0.02
 _LEAST_SPREAD_M = 0.1
-# A scale that differs from 1 by so many standard deviations, and by this share, is stated.
-_SCALE_SIGMAS, _LEAST_SCALE_SHARE = 4.0, 0.003
+# A scale that differs from 1 by this share, and by so many standard deviations more than a tape can be wrong,
+# is stated.
+_LEAST_SCALE_SHARE, _SCALE_SIGMAS, _TAPE_SHARE = 0.003, 4.0, 0.001
 _TOO_LITTLE_MOTION = (
     "too little motion to determine clock and alignment: drive curves at different speeds, and stop in "
     "between, or give --align none --time-offset S"
@@ -130,6 +133,37 @@ class PathAlignment:
         late_ns = np.round((times_ns - self.reference_ns) * self.drift).astype(np.int64)
         return times_ns + self.offset_ns + late_ns
 
+    def record_parameters(self, prefixes: Sequence[str] = ("",)) -> dict[str, str]:
+        """Return clock, frames and bodies for the record of a run, with all digits, and their sigmas.
+
+        What changes no pose and was not estimated is left out. The names of a body have its prefix.
+        """
+        values = {
+            "time_offset_s": (0.0, self.offset_sigma_s),
+            "clock_drift": (self.drift, self.drift_sigma),
+            "scale": (self.scale, self.scale_sigma),
+        }
+        vectors = {
+            "rotation_{}_rad": (self.turn_rad, self.turn_sigmas_rad),
+            "translation_{}_m": (self.motion.shift_m, self.shift_sigmas_m),
+        }
+        for prefix, body in zip(prefixes, self.bodies, strict=True):
+            values[f"{prefix}body_turn_rad"] = body.turn_rad, body.turn_sigma_rad
+            vectors[f"{prefix}pivot_{{}}_m"] = body.pivot_m, body.pivot_sigmas_m
+        for name, (vector, sigmas) in vectors.items():
+            values |= {name.format(axis): (vector[n], sigmas[n]) for n, axis in enumerate("xyz")}
+        parameters: dict[str, str] = {}
+        for name, (value, sigma) in values.items():
+            if value != (name == "scale") or np.isfinite(sigma):
+                parameters[name] = repr(float(value))
+            if np.isfinite(sigma):
+                parameters[sigma_name(name)] = f"{sigma:.4g}"
+        parameters["time_offset_s"] = seconds_text(self.offset_ns)
+        if self.drift:
+            parameters["reference_s"] = seconds_text(self.reference_ns)
+        texts = {"axes": self.axes, "remarks": "\n".join(self.remarks)}
+        return parameters | {name: text for name, text in texts.items() if text}
+
     def lab_poses(self, other: Trajectory) -> Trajectory:
         """Return the poses of the other body in the clock and the coordinates of the lab."""
         from scipy.spatial.transform import Rotation
@@ -144,6 +178,22 @@ class PathAlignment:
             points_m=self.motion.apply(other.points_m),
             quaternions=quaternions,
         )
+
+
+def sigma_name(name: str) -> str:
+    """Return the parameter of a record with the standard deviation of another one.
+
+    Examples
+    --------
+    >>> sigma_name("pivot_x_m"), sigma_name("scale")
+    ('pivot_x_sigma_m', 'scale_sigma')
+    """
+    return re.sub(r"(_(?:m|rad|s))?$", r"_sigma\1", name, count=1)
+
+
+def seconds_text(time_ns: int) -> str:
+    """Return a time in s with all of its nanoseconds."""
+    return f"{Decimal(time_ns).scaleb(-9):f}"
 
 
 def align_trajectories(pairs: Sequence[TrajectoryPair], known: KnownParts, where: str) -> PathAlignment:
@@ -208,9 +258,12 @@ def _result(problem: Problem, fit: ChosenFit) -> PathAlignment:
         pivots = [(state.pivots_m[n, :2], sigmas[n]) for n in numbers]
         turns = [(float(state.body_turns_rad[n]), sigma(f"body {n}")) for n in numbers]
         offset_sigma_s = sigma("offset")
+        if measured.freedom.turns and not problem.known.with_scale:
+            scale, scale_sigma = free_scale(problem.bodies, measured)
     _check_determined(problem, offset_sigma_s, turn_sigmas_rad)
     bodies = tuple(_body_frame(problem, *pivots[n], *turns[n]) for n in range(len(problem.bodies)))
-    _state_scale(problem, scale, scale_sigma, drifting is not None)
+    if not problem.known.with_scale:
+        problem.remarks += _scale_remarks(scale, scale_sigma)
     rotation = state.rotation * (scale if problem.known.with_scale else 1.0)
     motion = RigidMotion(rotation @ problem.upright, state.centre_m - rotation @ state.origin_m)
     offset_ns = problem.zero_ns + round(state.offset_s * NS_PER_S)
@@ -259,17 +312,13 @@ def _body_frame(
     return BodyFrame(full_m, full_sigmas_m, turn, turn_sigma)
 
 
-def _state_scale(problem: Problem, scale: float, sigma: float, is_drifting: bool) -> None:
+def _scale_remarks(scale: float, sigma: float) -> list[str]:
     share = abs(scale - 1)
-    if (
-        is_drifting
-        and not problem.known.with_scale
-        and share > max(_SCALE_SIGMAS * sigma, _LEAST_SCALE_SHARE)
-    ):
-        word = "short" if scale > 1 else "long"
-        problem.remarks.append(
-            f"its lengths are {100 * share:.1f} % too {word} (sigma {100 * sigma:.1f} %); they stay"
-        )
+    if not share >= max(_LEAST_SCALE_SHARE, _SCALE_SIGMAS * sigma + _TAPE_SHARE):
+        return []
+    word = "shorter" if scale > 1 else "longer"
+    numbers = f"{100 * share:.2g} % {word} than those of the tracks (sigma {100 * sigma:.2g} %)"
+    return [f"its lengths are {numbers}; they stay as they are"]
 
 
 def _residuals(problem: Problem, state: State, bodies: Sequence[BodyFrame], fit: PathFit) -> Residuals:

@@ -246,12 +246,29 @@ def fit_paths(
                 if fit is not None and (best.noise is None or fit.likelihood > best.likelihood):
                     best = fit
             state = best.state
+    return _refined(bodies, best, freedom)
+
+
+def _refined(bodies: Sequence[Body], fit: PathFit, freedom: Freedom) -> PathFit | None:
+    """Return the fit with all instants and the noise of its own residuals."""
     for _ in range(_NOISE_ESTIMATES):
-        best = _converged(bodies, best.state, freedom, best.noise or _rough(best), _ROUNDS)
-        if best is None:
+        found = _converged(bodies, fit.state, freedom, fit.noise or _rough(fit), _ROUNDS)
+        if found is None:
             return None
-        best = replace(best, noise=_estimated(best))
-    return _converged(bodies, best.state, freedom, best.noise, _ROUNDS)
+        fit = replace(found, noise=_estimated(found))
+    return _converged(bodies, fit.state, freedom, fit.noise, _ROUNDS)
+
+
+def free_scale(bodies: Sequence[Body], fit: PathFit) -> tuple[float, float]:
+    """Return the scale and its standard deviation if a fit had it free, too; NaN if such a fit fails.
+
+    The noise is estimated again: without the scale, its errors look like a smooth field over the floor.
+    """
+    free = _refined(bodies, fit, replace(fit.freedom, scale=True))
+    if free is None:
+        return float("nan"), float("nan")
+    scale = float(np.exp(free.state.log_scale))
+    return scale, scale * free.sigma("scale")
 
 
 def fit_white(bodies: Sequence[Body], state: State, freedom: Freedom) -> PathFit | None:

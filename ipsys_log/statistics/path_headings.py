@@ -7,7 +7,7 @@ import numpy as np
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Array
 from ipsys_log.statistics.ground_truth import wrap_angles
-from ipsys_log.statistics.path_pairs import Body, search_turns_s, smooth_values
+from ipsys_log.statistics.path_pairs import Body, search_turns, smooth_values
 from ipsys_log.vision.poses import rotate
 from ipsys_log.vision.time_brackets import bracket_times
 
@@ -91,7 +91,7 @@ def use_right_headings(
     """
 
     def agree(some: Sequence[Body]) -> bool:
-        tried = [*offsets_s, *search_turns_s(turn_pairs(some))[:2]]
+        tried = [*offsets_s, *(offset_s for offset_s, _ in search_turns(turn_pairs(some))[:2])]
         return any(turn_misfit(some, offset_s) < LARGEST_TURN_MISFIT for offset_s in tried)
 
     if agree(bodies):

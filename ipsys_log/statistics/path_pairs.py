@@ -233,8 +233,8 @@ _CANDIDATES = 5
 _APART_S = 1.0
 
 
-def search_offsets_s(pairs: Sequence[PathPair]) -> list[float]:
-    """Return time offsets to add to the true times, in s: those with the best agreement of speeds first.
+def search_speeds(pairs: Sequence[PathPair]) -> list[tuple[float, float]]:
+    """Return time offsets to add to the true times, in s, and correlations: the best agreement first.
 
     The agreement is the correlation of the speeds on the floor over all instants that both recordings have.
     It is searched over all offsets by the Fourier transform. Neighbours within 1 s count as one offset.
@@ -244,11 +244,11 @@ def search_offsets_s(pairs: Sequence[PathPair]) -> list[float]:
     Masked correlation: Padfield, "Masked object registration in the Fourier domain", IEEE Transactions on
     Image Processing 2012, eq. (23).
     """
-    return _search_s([(pair.true_s, pair.true_m, pair.track_s, pair.track_m) for pair in pairs], _speeds)
+    return _search([(pair.true_s, pair.true_m, pair.track_s, pair.track_m) for pair in pairs], _speeds)
 
 
-def search_turns_s(pairs: Sequence[tuple[Array, Array, Array, Array]]) -> list[float]:
-    """Return time offsets like :func:`search_offsets_s`, by the agreement of turn rates.
+def search_turns(pairs: Sequence[tuple[Array, Array, Array, Array]]) -> list[tuple[float, float]]:
+    """Return offsets and correlations like :func:`search_speeds`, by the agreement of turn rates.
 
     Turn rates depend neither on the coordinates nor on the place of the marker on its robot, and a
     dead-reckoned path has them right.
@@ -258,13 +258,13 @@ def search_turns_s(pairs: Sequence[tuple[Array, Array, Array, Array]]) -> list[f
     pairs : by robot the times (n,) in s and continuous headings (n,) in rad of the other recording, and those
         of the track, (m,) and (m,).
     """
-    return _search_s([(a_s, a[:, None], b_s, b[:, None]) for a_s, a, b_s, b in pairs], _turn_rates)
+    return _search([(a_s, a[:, None], b_s, b[:, None]) for a_s, a, b_s, b in pairs], _turn_rates)
 
 
 _Signal = Callable[[Array, Array, float], tuple[Array, Array]]
 
 
-def _search_s(pairs: Sequence[tuple[Array, Array, Array, Array]], signal: _Signal) -> list[float]:
+def _search(pairs: Sequence[tuple[Array, Array, Array, Array]], signal: _Signal) -> list[tuple[float, float]]:
     steps = [float(np.median(np.diff(t))) for pair in pairs for t in (pair[0], pair[2]) if len(t) > 1]
     if not steps:
         return []
@@ -275,7 +275,7 @@ def _search_s(pairs: Sequence[tuple[Array, Array, Array, Array]], signal: _Signa
     sums = np.zeros((6, size))
     for true_s, true, track_s, track in pairs:
         sums += _correlation_sums(signal(true_s, true, step_s), signal(track_s, track, step_s), size)
-    return _peaks_s(_scores(sums), step_s)
+    return _peaks(_scores(sums), sums[0], step_s)
 
 
 def _speeds(times_s: Array, points_m: Array, step_s: float) -> tuple[Array, Array]:
@@ -337,13 +337,14 @@ def _scores(sums: Array) -> Array:
     return np.where(enough, z, -np.inf)
 
 
-def _peaks_s(scores: Array, step_s: float) -> list[float]:
+def _peaks(scores: Array, counts: Array, step_s: float) -> list[tuple[float, float]]:
+    """Return the lags in s with the best scores, and the correlations there."""
     lags = np.arange(len(scores))
     lags = np.where(lags < len(scores) // 2, lags, lags - len(scores))
     waiting, apart = scores.copy(), _APART_S / step_s
-    found: list[float] = []
+    found: list[tuple[float, float]] = []
     while len(found) < _CANDIDATES and np.isfinite(waiting).any():
         best = int(waiting.argmax())
-        found.append(float(lags[best]) * step_s)
+        found.append((float(lags[best]) * step_s, float(np.tanh(scores[best] / np.sqrt(counts[best])))))
         waiting[np.abs(lags - lags[best]) < apart] = -np.inf
     return found

@@ -30,8 +30,8 @@ from ipsys_log.statistics.path_headings import (
 from ipsys_log.statistics.path_pairs import (
     Body,
     PathPair,
-    search_offsets_s,
-    search_turns_s,
+    search_speeds,
+    search_turns,
     smooth_values,
     thin,
 )
@@ -116,7 +116,7 @@ class Problem:
 
     def _is_mirrored(self) -> bool:
         """Return whether the mirrored path fits the tracks much better, at any coarse offset."""
-        for offset_s in self._given() or self._by_speed()[:3]:
+        for offset_s in self._coarse_s()[:3]:
             other_m, track_m = self._common(offset_s, np.zeros((len(self.bodies), 3)))
             if len(other_m) < LEAST_INSTANTS:
                 continue
@@ -133,18 +133,12 @@ class Problem:
         return np.eye(3), ""
 
     def _body(self, track: TrackedPath, other: Trajectory) -> Body:
-        from scipy.spatial.transform import Rotation
-
         rows = last_poses(track.positions)
         rows = rows[:: -(-len(rows) * len(self.pairs) // _MOST_INSTANTS)]
-        axes = np.full((len(other.times_ns), 3, 3), np.nan)
-        is_turned = np.isfinite(other.quaternions).all(axis=1)
-        if is_turned.any():
-            axes[is_turned] = self.upright @ Rotation.from_quat(other.quaternions[is_turned]).as_matrix()
         track_s = (track.positions.times_ns[rows] - self.track_ns) / NS_PER_S
         other_s = (other.times_ns - self.other_ns) / NS_PER_S
         seen = track_s, track.positions.points_m[rows], track.headings_rad[rows]
-        return Body.of(seen, other_s, other.points_m @ self.upright.T, axes)
+        return Body.of(seen, other_s, other.points_m @ self.upright.T, self.upright @ other.axes)
 
     @property
     def zero_ns(self) -> int:
@@ -168,7 +162,7 @@ class Problem:
     def check_headings(self) -> None:
         """Leave out headings that are not of the same body; see :func:`use_right_headings`."""
         if self.has_headings:
-            offsets_s = self._given() or self._by_speed()[:1]
+            offsets_s = self._coarse_s()[:1]
             self.bodies, remarks = use_right_headings(self.bodies, offsets_s, self.where)
             self.remarks += remarks
 
@@ -176,8 +170,18 @@ class Problem:
         given_ns = self.known.offset_ns
         return [] if given_ns is None else [(given_ns - self.zero_ns) / NS_PER_S]
 
-    def _by_speed(self) -> list[float]:
-        return search_offsets_s([PathPair(b.other_s, b.other_m, b.track_s, b.track_m) for b in self.bodies])
+    def _coarse_s(self) -> list[float]:
+        return self._given() or [offset_s for offset_s, _ in self._by_speed()]
+
+    def _by_speed(self) -> list[tuple[float, float]]:
+        return search_speeds([PathPair(b.other_s, b.other_m, b.track_s, b.track_m) for b in self.bodies])
+
+    def _by_turn(self) -> list[tuple[float, float]]:
+        return search_turns(turn_pairs(self.bodies)) if self.has_headings else []
+
+    def agreement(self) -> float:
+        """Return the correlation of the turn rates of both systems, or else of their speeds."""
+        return next((correlation for _, correlation in self._by_turn() or self._by_speed()), 0.0)
 
     def freedom(self) -> Freedom:
         turns, shifts, compared = ALIGNMENTS[self.known.align]
@@ -231,8 +235,7 @@ class Problem:
         """Return all coarse offsets with the likelihood of a rough fit, the best one first."""
         offsets_s = self._given()
         if not offsets_s:
-            by_turn = search_turns_s(turn_pairs(self.bodies)) if self.has_headings else []
-            for offset_s in [*by_turn, *self._by_speed()]:
+            for offset_s, _ in (*self._by_turn(), *self._by_speed()):
                 if all(abs(offset_s - other_s) > _APART_S for other_s in offsets_s):
                     offsets_s.append(offset_s)
         if not self.can_drift:
@@ -248,7 +251,10 @@ class Problem:
         for offset_s in offsets_s:
             other_m, track_m = self._common(offset_s, np.zeros((len(self.bodies), 3)))
             is_enough = len(other_m) >= LEAST_INSTANTS
-            misfits_m.append(_turned_misfit_m(other_m[:, :2], track_m[:, :2]) if is_enough else np.inf)
+            own_m, seen_m = other_m[:, :2], track_m[:, :2]
+            if is_enough and self.known.with_scale:
+                own_m = own_m * _turn_between(own_m, seen_m)[1]
+            misfits_m.append(_turned_misfit_m(own_m, seen_m) if is_enough else np.inf)
         limit_m = _NEAR_MISFIT * min(misfits_m, default=0.0) + _NEAR_MISFIT_M
         return [offset_s for offset_s, one in zip(offsets_s, misfits_m, strict=True) if one <= limit_m]
 
@@ -323,7 +329,7 @@ class Problem:
 
     def _check_scale(self) -> None:
         """Raise an error that names the unit if lengths of both systems differ by a factor."""
-        offset_s = (self._given() or self._by_speed())[0]
+        offset_s = self._coarse_s()[0]
         other_m, track_m = self._common(offset_s, np.zeros((len(self.bodies), 3)))
         if len(other_m) < LEAST_INSTANTS:
             return

@@ -33,6 +33,18 @@ class Trajectory:
     covariances: Array | None = None
     left_out: tuple[tuple[str, int], ...] = ()
 
+    @property
+    def axes(self) -> Array:
+        """The rotations (n, 3, 3) of the quaternions; NaN in the rows without one."""
+        # Late: most commands rotate nothing, and scipy takes long to load.
+        from scipy.spatial.transform import Rotation
+
+        found = np.full((len(self.times_ns), 3, 3), np.nan)
+        known = np.isfinite(self.quaternions).all(axis=1)
+        if known.any():
+            found[known] = Rotation.from_quat(self.quaternions[known]).as_matrix()
+        return found
+
 
 class TrajectoryPair(NamedTuple):
     """A robot in both systems."""

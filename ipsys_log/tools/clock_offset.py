@@ -12,7 +12,7 @@ import numpy as np
 
 from ipsys_log.errors import FitError
 from ipsys_log.messages import Array
-from ipsys_log.statistics.path_pairs import PathPair, common_instants, gap_limit_s, search_offsets_s
+from ipsys_log.statistics.path_pairs import PathPair, common_instants, gap_limit_s, search_speeds
 
 Span = tuple[float, float]
 Cameras = tuple[str, str]
@@ -135,7 +135,8 @@ def estimate_clock_offset(first: Iterable[MarkerPath], second: Iterable[MarkerPa
     candidates_s = [equal_s + step * _REFINED_S for step in range(-_NEAR_STEPS, _NEAR_STEPS + 1)]
     # Cameras without a common field of view have no common instants at the right offset.
     for cameras in sorted({pair.cameras for pair in pairs}):
-        candidates_s += search_offsets_s([pair.path for pair in pairs if pair.cameras == cameras])
+        coarse = search_speeds([pair.path for pair in pairs if pair.cameras == cameras])
+        candidates_s += [offset_s for offset_s, _ in coarse]
     fits = [fit for near_s in candidates_s if (fit := _refine(pairs, near_s)) is not None]
     if not fits and not any(_degrees(_on_grid(pairs, near_s).values()) for near_s in candidates_s):
         raise FitError("their common markers have too few common instants")

@@ -4,7 +4,6 @@ import hashlib
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,6 @@ from ipsys_log.engine.output import append_run, open_target
 from ipsys_log.engine.provenance import fingerprint, read_channels
 from ipsys_log.engine.request import Progress
 from ipsys_log.errors import IpsysError
-from ipsys_log.exchange.import_truth import sigma_name
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.location import LogLocation
 from ipsys_log.messages import IMPORTED, Array, Message, Run, Track, Tracks
@@ -22,21 +20,19 @@ from ipsys_log.messages.channels import ESTIMATE, TRACKS
 from ipsys_log.models.tracking.track_messages import gather_rows
 from ipsys_log.statistics.accuracy import root_mean_square_m
 from ipsys_log.statistics.estimate_scores import EstimateFrame, EstimateScore, score_estimate
+from ipsys_log.statistics.ground_truth import gather_paths
 from ipsys_log.statistics.path_alignment import PathAlignment
 from ipsys_log.tools.estimates import Body, CompareOptions, TrackedRobots, align_body, read_estimates
 from ipsys_log.units import NS_PER_S
-from ipsys_log.vision.poses import rotation
+from ipsys_log.vision.poses import rotation, rotation_vector
 
 # Poses of an estimate this long before and after the tracks are stored, too.
 _MARGIN_NS = NS_PER_S
 _LONGEST_NAME = 40
-_AXES = "xyz"
 # Parameters that are no numbers.
 _TEXTS = {
     *("format", "file", "file_sha256", "body", "robot", "align", "axes", "remarks", "with_scale"),
 }
-# The values of parameters that change no pose, except 0.
-_UNCHANGED = {"scale": "1"}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,7 +74,7 @@ class Comparison:
         """Return the parameters of the run, and the scores that are one number, in SI units."""
         score = self.score
         numbers: dict[str, Any] = {
-            name: text if name in _TEXTS else self.number(name)
+            name: text if name in _TEXTS else number_in(self.record, name)
             for name, text in self.record.parameters.items()
         }
         row = score.after(self.alignment)
@@ -95,24 +91,19 @@ class Comparison:
         known = {name: value for name, value in numbers.items() if value is not None}
         return {"run": self.record.run, "tracks_run": ", ".join(self.record.input_runs), **known}
 
-    def number(self, name: str) -> float:
-        """Return a parameter; the record leaves out those that neither were estimated nor change a pose."""
-        text = self.record.parameters.get(name, _UNCHANGED.get(name, "0"))
-        try:
-            return float(text)
-        except ValueError:
-            raise IpsysError(
-                f"run {self.record.run}: {name} is {text[:40]!r}, no number; compare again"
-            ) from None
 
-    def sigma(self, name: str) -> float:
-        """Return the standard deviation of a parameter; NaN if it was not estimated."""
-        sigma = sigma_name(name)
-        return self.number(sigma) if sigma in self.record.parameters else float("nan")
+def number_in(record: Run, name: str) -> float:
+    """Return a parameter; a record leaves out those that neither were estimated nor change a pose."""
+    text = record.parameters.get(name, "1" if name == "scale" else "0")
+    try:
+        return float(text)
+    except ValueError:
+        raise IpsysError(f"run {record.run}: {name} is {text[:40]!r}, no number; compare again") from None
 
-    def vector(self, name: str) -> Array:
-        """Return the three parameters of a name such as ``pivot_{}_m``."""
-        return np.array([self.number(name.format(axis)) for axis in _AXES])
+
+def _vector(record: Run, name: str) -> Array:
+    """Return the three parameters of a name such as ``pivot_{}_m``."""
+    return np.array([number_in(record, name.format(axis)) for axis in "xyz"])
 
 
 def compare(
@@ -190,19 +181,23 @@ def _poses(session: Session, record: Run) -> tuple[Message, ...]:
 
 def _scored(record: Run, messages: tuple[Message, ...], tracked: TrackedRobots) -> Comparison:
     found = Comparison(record, messages, None)  # type: ignore[arg-type]
-    turn = rotation(found.vector("rotation_{}_rad"))
+    turn = rotation(_vector(record, "rotation_{}_rad"))
     frame = EstimateFrame(
         # The turn of the x axis; the rest of the rotation levels the coordinates, such as y up, before it.
         float(np.arctan2(turn[1, 0], turn[0, 0])),
-        found.vector("translation_{}_m"),
-        found.number("scale") if found.with_scale else 1.0,
-        found.vector("pivot_{}_m"),
-        found.number("body_turn_rad"),
+        _vector(record, "translation_{}_m"),
+        number_in(record, "scale") if found.with_scale else 1.0,
+        _vector(record, "pivot_{}_m"),
+        number_in(record, "body_turn_rad"),
     )
     if not np.isfinite([frame.yaw_rad, *frame.shift_m, frame.scale, *frame.pivot_m, frame.turn_rad]).all():
         raise IpsysError(f"run {record.run}: its record has a value that is not finite; compare again")
     estimate, tracks = gather_rows(messages, found.robot)[0], tracked.rows(found.robot)
-    score = score_estimate(estimate, tracks, frame, found.with_scale, record.parameters["file"])
+    path, rotations = tracked.paths[found.robot], None
+    own = next((one for one in gather_paths(messages).values() if one.robot == found.robot), path)
+    if path.rotations_rad is not None and own.rotations_rad is not None:
+        rotations = own.axes_at(estimate.times_ns), path.axes_at(estimate.times_ns)
+    score = score_estimate(estimate, tracks, frame, found.with_scale, record.parameters["file"], rotations)
     return replace(found, score=score)
 
 
@@ -215,19 +210,7 @@ def _record(
     tracked: TrackedRobots,
 ) -> Run:
     """Return the record of a comparison, without its name, its number and its outputs."""
-    turn, known = found.bodies[0], options.known
-    estimates = {
-        "clock_drift": (found.drift, found.drift_sigma),
-        "body_turn_rad": (turn.turn_rad, turn.turn_sigma_rad),
-        "scale": (found.scale, found.scale_sigma),
-    }
-    for name, values, sigmas in (
-        ("rotation_{}_rad", found.turn_rad, found.turn_sigmas_rad),
-        ("translation_{}_m", found.motion.shift_m, found.shift_sigmas_m),
-        ("pivot_{}_m", turn.pivot_m, turn.pivot_sigmas_m),
-    ):
-        for axis, value, sigma in zip(_AXES, values.tolist(), sigmas.tolist(), strict=True):
-            estimates[name.format(axis)] = value, sigma
+    known = options.known
     texts = {
         "format": body.file.suffix.lower().removeprefix(".") or "bag",
         "file": body.file.name,
@@ -236,17 +219,8 @@ def _record(
         "robot": robot,
         "align": known.align,
         "with_scale": "yes" if known.with_scale else "",
-        "time_offset_s": str(Decimal(found.offset_ns).scaleb(-9)),
-        "reference_s": str(Decimal(found.reference_ns).scaleb(-9)) if found.drift else "",
-        "axes": found.axes,
-        "remarks": "\n".join(found.remarks),
     }
-    parameters = {name: text for name, text in texts.items() if text}
-    for name, (value, sigma) in (*estimates.items(), ("time_offset_s", (0.0, found.offset_sigma_s))):
-        if value != float(_UNCHANGED.get(name, "0")) or (name in estimates and np.isfinite(sigma)):
-            parameters[name] = repr(float(value))
-        if np.isfinite(sigma):
-            parameters[sigma_name(name)] = f"{sigma:.4g}"
+    parameters = {name: text for name, text in texts.items() if text} | found.record_parameters()
     inputs = read_channels(session, tracked.topics)
     return Run(0, "", IMPORTED, parameters, fingerprint(), input_runs=(tracked.run,), inputs=inputs)
 
@@ -285,19 +259,23 @@ def _messages(record: Run, body: Body, alignment: PathAlignment, tracked: Tracke
     The rows that the alignment leaves out, such as jumps, are here: they are errors of the estimate.
     """
     robot, topic = record.parameters["robot"], ESTIMATE.topic_of(record.run)
-    lab, track_ns = alignment.lab_poses(body.trajectory), tracked.paths[robot].positions.times_ns
+    path = tracked.paths[robot]
+    lab, track_ns = alignment.lab_poses(body.trajectory), path.positions.times_ns
     within = (lab.times_ns >= track_ns[0] - _MARGIN_NS) & (lab.times_ns <= track_ns[-1] + _MARGIN_NS)
     if not within.any():
         raise IpsysError(
             f"{body.where}: does not overlap in time with the tracks of {robot}; check --time-offset"
         )
-    x, y, z, w = lab.quaternions.T
-    headings_rad = np.arctan2(2 * (x * y + z * w), 1 - 2 * (y * y + z * z))
-    turn = alignment.motion.rotation
+    axes, turn = lab.axes, alignment.motion.rotation
+    headings_rad = np.arctan2(axes[:, 1, 0], axes[:, 0, 0])
+    # A level robot has headings alone, and so has an estimate on the floor.
+    has_tilt = path.rotations_rad is not None and (np.abs(body.trajectory.quaternions[:, :2]) > 0).any()
     for row in np.flatnonzero(within).tolist():
         x_m, y_m, z_m = lab.points_m[row].tolist()
         heading_rad = float(headings_rad[row]) if np.isfinite(headings_rad[row]) else None
         track = Track(robot, tracked.markers[robot], x_m, y_m, z_m, heading_rad)
+        if has_tilt and heading_rad is not None:
+            track = replace(track, rotation_rad=rotation_vector(axes[row]))
         covariance = None if lab.covariances is None else _known(lab.covariances[row])
         if covariance is not None:
             sigma_rad = float(np.sqrt(max(covariance[5, 5], 0.0)))

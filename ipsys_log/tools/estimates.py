@@ -1,9 +1,12 @@
 """Estimates of robots: their files, their robots, and their alignment with the tracks of a log."""
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
+
+import numpy as np
 
 from ipsys_log.engine.provenance import newest_run
 from ipsys_log.engine.request import Progress
@@ -17,10 +20,13 @@ from ipsys_log.models.tracking.track_messages import TrackRows, gather_rows
 from ipsys_log.plain_text import join_names, shell_words
 from ipsys_log.statistics.ground_truth import TrackedPath, gather_paths
 from ipsys_log.statistics.path_alignment import PathAlignment, align_trajectories
+from ipsys_log.statistics.path_problem import Problem
 from ipsys_log.statistics.trajectories import KnownParts, Trajectory, TrajectoryPair
 
 # A robot is guessed if its residuals are smaller than this part of those of any other robot.
 _MOST_RATIO = 0.5
+# A correlation of 0.7, as Fisher's z. Paths of other drives reach half of it at some time offset.
+_SURE_AGREEMENT = float(np.arctanh(0.7))
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,10 +158,10 @@ def align_body(body: Body, tracked: TrackedRobots, known: KnownParts) -> tuple[s
     """Return the robot of a body and its alignment; the robot is guessed if only one fits well."""
 
     def align(name: str) -> PathAlignment:
-        pair = TrajectoryPair(body.trajectory, tracked.paths[name])
-        return align_trajectories([pair], known, body.where)
+        return align_trajectories([pairs[name]], known, body.where)
 
-    names = [body.robot] if body.robot else sorted(tracked.paths)
+    pairs = {name: TrajectoryPair(body.trajectory, path) for name, path in sorted(tracked.paths.items())}
+    names = [body.robot] if body.robot else _likely_robots(pairs, known)
     if len(names) == 1:
         return names[0], align(names[0])
     fitting, reason = dict[str, PathAlignment](), ""
@@ -174,3 +180,15 @@ def align_body(body: Body, tracked: TrackedRobots, known: KnownParts) -> tuple[s
             "with --robot NAME"
         )
     return ranked[0], fitting[ranked[0]]
+
+
+def _likely_robots(pairs: dict[str, TrajectoryPair], known: KnownParts) -> list[str]:
+    """Return the robots whose motion agrees with that of a body: a fit of each robot takes seconds."""
+    if len(pairs) == 1 or known.offset_ns is not None:
+        return [*pairs]
+    scores = dict.fromkeys(pairs, 0.0)
+    for name, pair in pairs.items():
+        with suppress(IpsysError):  # such as too few poses: its fit says so
+            scores[name] = float(np.arctanh(Problem([pair], known, "").agreement()))
+    best = max(scores.values())
+    return [name for name, score in scores.items() if best < _SURE_AGREEMENT or score >= best / 2]

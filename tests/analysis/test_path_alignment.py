@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from decimal import Decimal
 
 import numpy as np
 import pytest
@@ -128,7 +129,7 @@ def test_drift_of_odometry_pulls_neither_clock_nor_pivot() -> None:
     assert abs(offset_error_s(found)) < min(0.005, 4 * found.offset_sigma_s)
     assert np.abs(found.bodies[0].pivot_m - PIVOT_M).max() < 0.02
     assert abs(found.scale - 1 / 1.02) < 4 * found.scale_sigma
-    assert "too long" in " ".join(found.remarks)
+    assert "longer than those of the tracks" in " ".join(found.remarks)
 
 
 def frozen(other: Trajectory) -> Trajectory:
@@ -264,9 +265,35 @@ def test_given_parts_stay_as_they_are() -> None:
     np.testing.assert_array_equal(found.bodies[0].pivot_m, PIVOT_M)
 
 
+@pytest.mark.parametrize(
+    ("scale", "field_m", "remark"),
+    [(0.996, 0.0, "its lengths are 0.4 % shorter"), (1.002, 0.0, ""), (1.0, 0.02, "")],
+)
+def test_scale_of_a_measured_path_is_named_and_stays(scale: float, field_m: float, remark: str) -> None:
+    pair = make_pair(field_m=field_m)
+    found = align(pair._replace(other=replace(pair.other, points_m=pair.other.points_m * scale)))
+    assert abs(1 / found.scale - scale) < 4 * found.scale_sigma
+    assert np.linalg.det(found.motion.rotation) == pytest.approx(1.0)
+    assert [text.partition(" than")[0] for text in found.remarks] == [remark] * bool(remark)
+
+
 def test_scale_is_applied_only_if_asked_for() -> None:
     pair = make_pair()
     small = pair._replace(other=replace(pair.other, points_m=pair.other.points_m * 0.4))
     found = align(small, with_scale=True)
     assert found.scale == pytest.approx(2.5, abs=4 * found.scale_sigma)
     assert found.residuals.rmse_2d_m < 0.003
+
+
+def test_record_has_the_clock_with_its_reference() -> None:
+    late = replace(align(make_pair()), drift=3e-5, reference_ns=START_NS - 7_000_000_001)
+    texts = late.record_parameters()
+    times_ns = START_NS + np.array([0, 50 * NS_PER_S])
+    offset, drift, reference = (
+        Decimal(texts[name]) for name in ("time_offset_s", "clock_drift", "reference_s")
+    )
+    for time_ns, lab_ns in zip(times_ns.tolist(), late.lab_times_ns(times_ns).tolist(), strict=True):
+        time_s = Decimal(time_ns).scaleb(-9)
+        assert float(
+            time_s + offset + drift * (time_s - reference) - Decimal(lab_ns).scaleb(-9)
+        ) == pytest.approx(0.0, abs=2e-9)

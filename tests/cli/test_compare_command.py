@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +12,7 @@ import numpy as np
 import pytest
 from evo.core import metrics
 from evo.core.trajectory import PosePath3D
+from evo.core.units import Unit
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -19,12 +22,22 @@ from ipsys_log.exchange.trajectory_files import TrajectoryFile
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import IMPORTED, RIG_TOPIC, Message, Run, Track, Tracks
 from ipsys_log.messages.channels import ESTIMATE, RECORD
-from ipsys_log.statistics.trajectories import Trajectory
+from ipsys_log.statistics.path_alignment import PathAlignment, align_trajectories
+from ipsys_log.statistics.trajectories import Trajectory, TrajectoryPair
 from ipsys_log.tools import estimates
 from ipsys_log.tools.publish.kept_contents import kept_channels
 from ipsys_log.units import NS_PER_S
 from tests.conftest import Ipsys, data_section
-from tests.exchange.driven_lab import LAB, OtherSystem, instants_ns, tracked, write_lab
+from tests.exchange.driven_lab import (
+    LAB,
+    OtherSystem,
+    evo_rmse_m,
+    instants_ns,
+    path_of,
+    tilted,
+    tracked,
+    write_lab,
+)
 
 Array = NDArray[np.float64]
 
@@ -39,25 +52,35 @@ def log(tmp_path: Path) -> Path:
     return write_lab(tmp_path / "lab.mcap", SECONDS)
 
 
-def body_path(log: Path, robot: str = "ada") -> tuple[NDArray[np.int64], Array, Rotation]:
+def body_path(
+    log: Path, robot: str = "ada", is_tilted: bool = False
+) -> tuple[NDArray[np.int64], Array, Rotation]:
     """Return times, points and rotations of a body behind the marker of a robot, in the lab."""
     with ipsys_api.open(log) as opened:
         table = opened.table("tracks")
     rows = table[table["robot"] == robot]
-    turns = Rotation.from_euler("z", rows["heading_rad"].to_numpy()[:, None])
-    points_m = rows[["x_m", "y_m", "z_m"]].to_numpy() + turns.apply(PIVOT_M)
-    return np.asarray(rows["time"].astype(np.int64)), points_m, turns
+    headings_rad, times_ns = rows["heading_rad"].to_numpy(), np.asarray(rows["time"].astype(np.int64))
+    turns = tilted(headings_rad, times_ns) if is_tilted else Rotation.from_euler("z", headings_rad[:, None])
+    return times_ns, rows[["x_m", "y_m", "z_m"]].to_numpy() + turns.apply(PIVOT_M), turns
 
 
-def odometry(log: Path, robot: str = "ada", drift: float = 0.01) -> tuple[NDArray[np.int64], Array, Rotation]:
-    """Return the same in the clock and the frame of an odometry, whose x is too long by a share."""
-    times_ns, points_m, turns = body_path(log, robot)
+def odometry(
+    log: Path, robot: str = "ada", drift: float = 0.01, is_tilted: bool = False
+) -> tuple[NDArray[np.int64], Array, Rotation]:
+    """Return the same in the clock and the frame of an odometry, whose x is too long by a share.
+
+    The rotations of a tilted body have errors about all axes.
+    """
+    times_ns, points_m, turns = body_path(log, robot, is_tilted)
     points_m[:, 0] += drift * (points_m[:, 0] - points_m[0, 0])
+    turns *= Rotation.from_rotvec(is_tilted * np.random.default_rng(2).normal(0, 0.02, points_m.shape))
     return ODOM.times_ns(times_ns), ODOM.points_m(points_m), ODOM.lab_from_own.inv() * turns
 
 
-def write_tum(path: Path, log: Path, robot: str = "ada", per_m: float = 1.0, late_s: int = 0) -> Path:
-    times_ns, points_m, turns = odometry(log, robot)
+def write_tum(
+    path: Path, log: Path, robot: str = "ada", per_m: float = 1.0, late_s: int = 0, is_tilted: bool = False
+) -> Path:
+    times_ns, points_m, turns = odometry(log, robot, is_tilted=is_tilted)
     lines = [
         f"{time_ns // NS_PER_S + late_s}.{time_ns % NS_PER_S:09d} " + " ".join(map(repr, [*point, *turn]))
         for time_ns, point, turn in zip(
@@ -74,16 +97,22 @@ def compared(ipsys: Ipsys, *arguments: object) -> list[dict[str, Any]]:
     return list(json.loads(done.out)["comparisons"])
 
 
-def test_errors_of_an_odometry_are_those_of_evo(log: Path, tmp_path: Path, ipsys: Ipsys) -> None:
-    [found] = compared(ipsys, log, write_tum(tmp_path / "odom.tum", log), *KNOWN)
+@pytest.mark.parametrize("is_tilted", [False, True])
+def test_errors_of_an_odometry_are_those_of_evo(tmp_path: Path, ipsys: Ipsys, is_tilted: bool) -> None:
+    log = write_lab(tmp_path / "lab.mcap", SECONDS, is_tilted=is_tilted)
+    [found] = compared(ipsys, log, write_tum(tmp_path / "odom.tum", log, is_tilted=is_tilted), *KNOWN)
     body_turn = Rotation.from_rotvec([0, 0, found["body_turn_rad"]])
     truth, own = (
         PosePath3D(positions_xyz=points_m, orientations_quat_wxyz=(turns * turn).as_quat(scalar_first=True))
         for (_, points_m, turns), turn in (
-            (body_path(log), body_turn),
-            (odometry(log), Rotation.identity()),
+            (body_path(log, is_tilted=is_tilted), body_turn),
+            (odometry(log, is_tilted=is_tilted), Rotation.identity()),
         )
     )
+    turn_key = "rotation_rmse_rad" if is_tilted else "heading_rmse_rad"
+    relative = metrics.RPE(ANGLE, 30, Unit.frames, all_pairs=True)
+    relative.process_data((truth, own))
+    assert found["rpe"][1][turn_key] == pytest.approx(relative.get_statistic(RMSE), abs=1e-6)
     for kind in ("none", "first_pose", "se3"):
         if kind == "first_pose":
             own.align_origin(truth)
@@ -92,14 +121,34 @@ def test_errors_of_an_odometry_are_those_of_evo(log: Path, tmp_path: Path, ipsys
         absolute = metrics.APE(metrics.PoseRelation.translation_part)
         absolute.process_data((truth, own))
         assert found["ate"][kind]["3d"]["rmse_m"] == pytest.approx(absolute.get_statistic(RMSE), abs=1e-6)
-    turned = metrics.APE(metrics.PoseRelation.rotation_angle_rad)
+    turned = metrics.APE(ANGLE)
     turned.process_data((truth, own))
-    assert found["ate"]["se3"]["heading_rmse_rad"] == pytest.approx(turned.get_statistic(RMSE), abs=1e-6)
+    assert found["ate"]["se3"][turn_key] == pytest.approx(turned.get_statistic(RMSE), abs=1e-6)
     assert found["ate_m"] == found["ate"]["yaw"]["3d"]["rmse_m"]
-    assert 0.0 < found["drift_share"] < 0.01
+    assert 0.0 < found["drift_share"] < (0.03 if is_tilted else 0.01)
+    assert compared(ipsys, log) == [found]
 
 
-RMSE = metrics.StatisticsType.rmse
+def test_trimmed_export_has_the_errors_of_the_comparison(log: Path, tmp_path: Path, ipsys: Ipsys) -> None:
+    # Half of the stamps lie between those of the tracks, and the estimate begins before them.
+    file = write_tum(tmp_path / "odom.tum", log)
+    lines = file.read_text().splitlines()
+    early = [f"{Decimal(line.split()[0]) - Decimal('0.011')} {line.partition(' ')[2]}" for line in lines[::2]]
+    file.write_text("\n".join(line for pair in zip(early, lines[1::2], strict=True) for line in pair))
+    [found] = compared(ipsys, log, file, *KNOWN, "--scale")
+    done = ipsys("export", log, "-o", tmp_path / "a.tum", "--table", "estimate", "--trim")
+    assert "a.tum written: 359 poses of estimate" in done.out, done
+    for alignment, options in {
+        "none": (),
+        "first_pose": ("--align_origin",),
+        "se3": ("--align",),
+        "sim3": ("--align", "--correct_scale"),
+    }.items():
+        ate_m = evo_rmse_m(tmp_path / "a_truth.tum", tmp_path / "a.tum", *options)
+        assert found["ate"][alignment]["3d"]["rmse_m"] == pytest.approx(ate_m, abs=1e-6), alignment
+
+
+RMSE, ANGLE = metrics.StatisticsType.rmse, metrics.PoseRelation.rotation_angle_rad
 
 
 def test_comparison_stays_in_the_log(log: Path, tmp_path: Path, ipsys: Ipsys) -> None:
@@ -128,6 +177,8 @@ def test_comparison_stays_in_the_log(log: Path, tmp_path: Path, ipsys: Ipsys) ->
     assert ipsys("report", log, "--html", tmp_path / "lab.html").code == 0
     page = (tmp_path / "lab.html").read_text()
     assert "odom.tum: estimate of ada, against its tracks of run poly (the ground truth)" in page
+    assert "odom.tum (run odom_2): estimate of ada" in page
+    assert "<li>Scale, applied: 0.99" in page
     assert ipsys("cut", log, "-o", tmp_path / "cut.mcap", "--start", 4).code == 0
     first, _ = compared(ipsys, tmp_path / "cut.mcap")
     assert first["ate"]["none"]["3d"]["count"] < found["ate"]["none"]["3d"]["count"]
@@ -169,6 +220,28 @@ def test_robots_of_a_table_and_of_another_log_are_known(log: Path, tmp_path: Pat
     assert max(map(len, done.out.splitlines())) <= 80
     assert "noisy.mcap: estimate of bob, against its tracks of run poly (the ground truth)" in done.out
     assert "noisy_2" not in done.err
+
+
+def test_robot_is_guessed_by_one_fit_if_motion_tells(
+    log: Path, tmp_path: Path, ipsys: Ipsys, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fitted = []
+
+    def fit(pairs: Sequence[TrajectoryPair], *rest: Any) -> PathAlignment:
+        fitted.append(pairs[0].track.robot)
+        return align_trajectories(pairs, *rest)
+
+    monkeypatch.setattr(estimates, "align_trajectories", fit)
+    [found] = compared(ipsys, log, write_tum(tmp_path / "odom.tum", log, "bob"))
+    assert (found["robot"], fitted) == ("bob", ["bob"])
+
+
+def test_robots_that_drive_alike_are_not_guessed(tmp_path: Path, ipsys: Ipsys) -> None:
+    times_ns = instants_ns(SECONDS)
+    points_m = path_of(0)((times_ns - times_ns[0]) / NS_PER_S)
+    write_log(tmp_path / "lab.mcap", tracked(times_ns, {"ada": points_m, "bob": points_m + 0.5}))
+    done = ipsys("compare", tmp_path / "lab.mcap", write_tum(tmp_path / "odom.tum", tmp_path / "lab.mcap"))
+    assert "fits the tracks of ada, bob in run poly; name its robot with --robot NAME" in done.err
 
 
 @pytest.mark.parametrize(

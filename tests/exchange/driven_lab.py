@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
+import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -45,6 +49,7 @@ def tracked(
     points_m: dict[str, Array],
     with_record: bool = True,
     with_headings: bool = True,
+    is_tilted: bool = False,
 ) -> Iterator[Message]:
     """Yield the messages of a log: the rig, the tracks of the run ``poly``, and its record."""
     yield Message(RIG_TOPIC, START_NS - 1, START_NS - 1, LAB)
@@ -55,7 +60,11 @@ def tracked(
             ahead = rows[min(n + 1, len(rows) - 1)] - rows[max(n - 1, 0)]
             heading_rad = float(np.arctan2(ahead[1], ahead[0])) if with_headings else None
             x_m, y_m, z_m = rows[n].tolist()
-            tracks.append(Track(robot, ROBOTS[robot], x_m, y_m, z_m, heading_rad))
+            track = Track(robot, ROBOTS[robot], x_m, y_m, z_m, heading_rad)
+            if is_tilted and heading_rad is not None:
+                vector_rad = tilted(np.array([heading_rad]), times_ns[[n]])[0].as_rotvec()
+                track = replace(track, rotation_rad=vector_rad)
+            tracks.append(track)
         yield Message(topic, time_ns, time_ns, Tracks(time_ns, tuple(tracks)))
     if with_record:
         written = (ChannelWritten(topic, len(times_ns)),)
@@ -63,8 +72,18 @@ def tracked(
         yield Message(RECORD.topic_of("poly"), time_ns, time_ns, record)
 
 
+def tilted(headings_rad: Array, times_ns: NDArray[np.int64]) -> Rotation:
+    """Return rotations with these headings of bodies that sway by up to 35 degrees."""
+    sway_rad = 0.6 * np.sin(np.outer((times_ns - START_NS) / NS_PER_S, [1.7, 1.3]))
+    return Rotation.from_euler("ZYX", np.column_stack([headings_rad, sway_rad]))
+
+
 def write_lab(
-    path: Path, seconds: float = 30.0, noise_m: float = 0.0, robots: tuple[str, ...] = ("ada", "bob")
+    path: Path,
+    seconds: float = 30.0,
+    noise_m: float = 0.0,
+    robots: tuple[str, ...] = ("ada", "bob"),
+    is_tilted: bool = False,
 ) -> Path:
     """Write a log of two robots that drive, with normal errors of their tracks."""
     rng, times_ns = np.random.default_rng(0), instants_ns(seconds)
@@ -73,8 +92,24 @@ def write_lab(
         robot: path_of(ROBOTS[robot])(times_s) + rng.normal(0, noise_m, (len(times_ns), 3)) * [1, 1, 0]
         for robot in robots
     }
-    write_log(path, tracked(times_ns, points_m))
+    write_log(path, tracked(times_ns, points_m, is_tilted=is_tilted))
     return path
+
+
+def evo_rmse_m(truth: Path, estimate: Path, *options: str) -> float:
+    """Return the RMSE of the absolute trajectory error of TUM files, by evo."""
+    folder = truth.parent
+    subprocess.run(
+        [
+            *map(str, (Path(sys.executable).with_name("evo_ape"), "tum", truth, estimate, *options)),
+            *("--no_warnings", "--save_results", str(folder / "ape.zip")),
+        ],
+        check=True,
+        capture_output=True,
+        env={"HOME": str(folder), "PATH": "/usr/bin:/bin"},
+    )
+    with zipfile.ZipFile(folder / "ape.zip") as archive:
+        return float(json.loads(archive.read("stats.json"))["rmse"])
 
 
 class OtherSystem:

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
-import sys
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +15,7 @@ from scipy.spatial.transform import Rotation
 import ipsys_log as ipsys
 from ipsys_log import IpsysError
 from ipsys_log.exchange import data_frames
+from tests.exchange.driven_lab import evo_rmse_m
 from tests.sinks.streaming import TILT_RAD, tilted_track, write_tilted
 
 
@@ -78,25 +76,9 @@ def _comparable(value: object) -> object:
     return None if not isinstance(value, dict) and pd.isna(value) else value  # type: ignore[call-overload]
 
 
-def _evo_rmse_m(truth: Path, estimate: Path, folder: Path) -> float:
-    """Return the RMSE of the absolute trajectory error, without alignment, by evo."""
-    subprocess.run(
-        [
-            *(Path(sys.executable).with_name("evo_ape"), "tum", truth, estimate),
-            *("--no_warnings", "--save_results", folder / "ape.zip"),
-        ],
-        check=True,
-        capture_output=True,
-        env={"HOME": str(folder), "PATH": "/usr/bin:/bin"},
-    )
-    with zipfile.ZipFile(folder / "ape.zip") as archive:
-        return float(json.loads(archive.read("stats.json"))["rmse"])
-
-
 def test_evo_finds_the_error_of_the_tracks(log: Path, tmp_path: Path) -> None:
     with ipsys.open(log) as opened:
-        for name in ("tracks", "truth"):
-            opened.export(tmp_path / f"{name}.tum", name, robot="robot_0")
+        exported = opened.export(tmp_path / "track.tum", robot="robot_0", trim=True)
         tracks, truth = (
             table[table["robot"] == "robot_0"].drop_duplicates("time", keep="last")
             for table in (opened.table("tracks"), opened.table("truth"))
@@ -104,8 +86,8 @@ def test_evo_finds_the_error_of_the_tracks(log: Path, tmp_path: Path) -> None:
     both = tracks.merge(truth, on="time", suffixes=("", "_true"))
     offsets_m = np.array([both[f"{axis}_m"] - both[f"{axis}_m_true"] for axis in "xyz"])
     expected_m = float(np.sqrt((offsets_m**2).sum(axis=0).mean()))
-    assert len(both) > 10
-    assert _evo_rmse_m(tmp_path / "truth.tum", tmp_path / "tracks.tum", tmp_path) == pytest.approx(
+    assert len(both) == exported.rows > 10
+    assert evo_rmse_m(tmp_path / "track_truth.tum", tmp_path / "track.tum") == pytest.approx(
         expected_m, abs=1e-6
     )
 
@@ -126,6 +108,8 @@ def test_kitti_rows_are_the_poses_of_tum(log: Path, tmp_path: Path) -> None:
     ("name", "options", "text"),
     [
         ("a.tum", {}, "choose one"),
+        ("a.tum", {"trim": True}, "needs one robot with tracks .* robot_0, robot_1"),
+        ("a.csv", {"trim": True, "robot": "robot_0"}, "--trim needs one run, and a name in .tum"),
         ("a.tum", {"robot": "ada"}, "has no robot 'ada'"),
         ("a.csv", {"robot": "ada"}, "has no robot 'ada'"),
         ("a.tum", {"table": "markers"}, "is no trajectory"),

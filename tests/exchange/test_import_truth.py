@@ -273,7 +273,7 @@ def test_log_without_tracks_needs_offset_and_no_alignment(tmp_path: Path, ipsys:
     assert not (tmp_path / "new.mcap").exists()
     done = ipsys(*arguments, "--align", "none", "--time-offset", "1.5")
     assert done.code == 0
-    assert "Time offset: 1.500000 s (given)" in done.out
+    assert "Time offset: 1.500000 s, added to the times of the file" in done.out
     frames = stored(tmp_path / "new.mcap")
     assert (frames[0].timestamp, len(frames)) == (1_500_000_000, 100)
     assert isinstance(frames[0].tracks[0], Track)

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import importlib
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
-from tests.publish.packs import change_scores
+import ipsys_log as ipsys_api
+from ipsys_log.tools.publish.packing import pack
+from tests.conftest import ROOT, Ipsys
+from tests.publish.packs import change_scores, write_card
 from tests.test_benchmarks import BENCHMARKS
 
 OWN = """
@@ -74,3 +79,23 @@ def test_leaderboard_scores_packs_again(packed: Path, dataset: Path, tmp_path: P
     assert errors["poly"] == errors["mine.py:Estimator"]
     assert [cell.startswith("≠") for cell in errors["rigid"]] == [False, True]
     assert lines[-1] == ["≠", "does", "not", "come", "out", "as", "stated"]
+
+
+@pytest.mark.slow
+def test_leaderboard_scores_estimates_of_drives(board: Any, tmp_path: Path, ipsys: Ipsys) -> None:
+    log = Path(shutil.copy(ROOT / "sample_logs" / "drive_lab.mcap", tmp_path))
+    ipsys_api.replay(log, model="rigid")
+    with ipsys_api.open(log) as opened:
+        tracks = opened.table("tracks")
+    ada = tracks[tracks["robot"] == "robot_0"][["time", "x_m", "y_m", "z_m", "heading_rad"]]
+    for name, noise_m in (("slam", 0.01), ("wheels", 0.05)):
+        noisy = ada.assign(x_m=ada["x_m"] + np.random.default_rng(0).normal(0, noise_m, len(ada)))
+        (tmp_path / name).mkdir()
+        noisy.to_csv(tmp_path / name / "monday.csv", index=False)
+    assert ipsys("compare", log, tmp_path / "slam" / "monday.csv", "--robot", "robot_0").code == 0
+    pack([log], tmp_path / "monday", write_card(tmp_path / "card.toml"), models=("rigid",))
+    folders = [tmp_path / "slam", tmp_path / "wheels"]
+    scores = board.estimate_scores(str(tmp_path / "monday"), "monday", folders)
+    assert scores["monday"][0] == pytest.approx(10, rel=0.1)
+    assert scores["slam"][0] == pytest.approx(10, rel=0.1)
+    assert scores["wheels"][0] == pytest.approx(50, rel=0.1)

@@ -29,41 +29,56 @@ from ipsys_log.messages.channels import TRACKS
 from ipsys_log.models.tracking.track_messages import gather_rows
 from ipsys_log.statistics.accuracy import root_mean_square_m
 from ipsys_log.statistics.estimate_scores import EstimateFrame, score_estimate
-from ipsys_log.statistics.ground_truth import TrajectoryErrors, gather_paths, pairs_at, trajectory_errors
+from ipsys_log.statistics.ground_truth import (
+    TrackedPath,
+    TrajectoryErrors,
+    gather_paths,
+    pairs_at,
+    trajectory_errors,
+)
 from ipsys_log.units import NS_PER_S
 from tests.exchange.driven_lab import ROBOTS, START_NS, instants_ns, path_of, tracked, write_lab
 
 SECONDS = 12.0
 
 
-def truth_messages(with_headings: bool) -> Iterator[Message]:
+def truth_messages(turn: str) -> Iterator[Message]:
     times_ns = instants_ns(SECONDS)
     points_m = {robot: path_of(seed)((times_ns - START_NS) / NS_PER_S) for robot, seed in ROBOTS.items()}
-    for message in tracked(times_ns, points_m, with_record=False, with_headings=with_headings):
+    for message in tracked(times_ns, points_m, False, turn != "positions", turn == "rotations"):
         if message.topic == TRACKS.topic_of("poly"):
             yield Message(TRUTH_TOPIC, message.log_time_ns, message.publish_time_ns, message.payload)
 
 
-@pytest.fixture(scope="module", params=[True, False], ids=["headings", "positions"])
+@pytest.fixture(scope="module", params=["headings", "positions", "rotations"])
 def log(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = write_lab(tmp_path_factory.mktemp("metrics") / "lab.mcap", SECONDS, 0.01)
+    folder = tmp_path_factory.mktemp("metrics")
+    path = write_lab(folder / "lab.mcap", SECONDS, 0.01, is_tilted=request.param == "rotations")
     append_messages(path, truth_messages(request.param))
     return path
 
 
-def errors_of(log: Path) -> list[TrajectoryErrors]:
+def paths_of(log: Path, name: str) -> dict[int, TrackedPath]:
     with Session([log]) as session:
-        tracks, truth = (
-            gather_paths(session.messages(topics))
-            for topics in (session.topics(TRACKS, "poly"), [TRUTH_TOPIC])
-        )
-    return trajectory_errors(tracks, truth)
+        topics = [TRUTH_TOPIC] if name == "truth" else session.topics(TRACKS, "poly")
+        return gather_paths(session.messages(topics))
+
+
+def errors_of(log: Path) -> list[TrajectoryErrors]:
+    return trajectory_errors(paths_of(log, "tracks"), paths_of(log, "truth"))
 
 
 def evo_paths(log: Path, folder: Path, robot: str) -> tuple[PosePath3D, PosePath3D, bool]:
-    """Return truth and track as evo reads exported TUM files; without headings, from the tables."""
+    """Return truth and track as evo reads exported TUM files; those of tilted bodies from the messages."""
     paths = []
     with ipsys.open(log) as opened:
+        for found in (paths_of(log, name) for name in ("truth", "tracks")):
+            path = next(one for one in found.values() if one.robot == robot)
+            if path.rotations_rad is not None:
+                turns = Rotation.from_rotvec(path.rotations_rad).as_quat(scalar_first=True)
+                paths.append(PosePath3D(positions_xyz=path.positions.points_m, orientations_quat_wxyz=turns))
+        if paths:
+            return paths[0], paths[1], True
         has_headings = bool(opened.table("truth")["heading_rad"].notna().all())
         for name in ("truth", "tracks"):
             if has_headings:
@@ -121,7 +136,10 @@ def test_scores_of_an_estimate_are_those_of_evo(log: Path, tmp_path: Path) -> No
     wave_m = np.outer(np.sin(np.arange(len(true.times_ns)) / 10), [0.0, 0.0, 0.1])
     for rows in (estimate, true):
         rows.points_m[:] += wave_m
-    score = score_estimate(estimate, true, frame, True, "ada.tum")
+    paths = [next(iter(paths_of(log, name).values())) for name in ("tracks", "truth")]
+    is_tilted = all(path.rotations_rad is not None for path in paths)
+    rotations = tuple(path.axes_at(true.times_ns) for path in paths) if is_tilted else None
+    score = score_estimate(estimate, true, frame, True, "ada.tum", rotations)  # type: ignore[arg-type]
     truth, lab, has_headings = evo_paths(log, tmp_path, "ada")
     truth, lab = (
         PosePath3D(path.positions_xyz + wave_m, path.orientations_quat_wxyz) for path in (truth, lab)
@@ -146,8 +164,8 @@ def test_scores_of_an_estimate_are_those_of_evo(log: Path, tmp_path: Path) -> No
         if has_headings:
             turned = metrics.APE(metrics.PoseRelation.rotation_angle_rad)
             turned.process_data((truth, own))
-            # Tracks have headings alone, so the tilt of a fit in space is in the rotations of evo only.
-            tilt_rad = 1e-4 if row.alignment in ("se3", "sim3") else 1e-6
+            # Level tracks have headings alone, so the tilt of a fit in space is in the rotations of evo only.
+            tilt_rad = 1e-4 if row.alignment in ("se3", "sim3") and not is_tilted else 1e-6
             assert np.abs(row.turns_rad) == pytest.approx(turned.error, abs=tilt_rad), row.alignment
     for one, (delta, unit) in zip(score.relative, [(1.0, Unit.meters), (30, Unit.frames)], strict=True):
         relations = {one.relation.replace("_", " "): one.errors_m}

@@ -232,6 +232,10 @@ def export(
         setting("--run", "NAME", "Export this run instead of the newest; repeat it for several."),
     ] = None,
     robot: Annotated[str | None, setting("--robot", "NAME", "Export only this robot.")] = None,
+    trim: Annotated[
+        bool,
+        switch("--trim", "Write a trajectory and its ground truth (FILE_truth), both at the same instants."),
+    ] = False,
     without_images: Annotated[
         bool, switch("--without-images", "Leave the images out of a ROS 2 bag.")
     ] = False,
@@ -251,7 +255,7 @@ def export(
         ipsys export monday.mcap -o tracks.csv
         ipsys export monday.mcap -o tracks.parquet --run poly --run best
         ipsys export monday.mcap -o robot.tum --robot robot_0    # for evo
-        ipsys export monday.mcap -o truth.tum --robot robot_0 --table truth
+        ipsys export monday.mcap -o r.tum --robot robot_0 --trim   # evo_ape tum r_truth.tum r.tum
         ipsys export monday.mcap -o bag.mcap --format ros2       # with images
         ipsys export monday.mcap -o view.mp4 --size 1920x1080
         ipsys export monday.mcap -o markers --format coco        # a new folder
@@ -275,6 +279,7 @@ def export(
             with_images=not without_images,
             rate_hz=frame_rate,
             size_px=parse_size(size),
+            trim=trim,
             progress=progress,
         )
     console.print(

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 from ipsys_log.app.report.json_format import plain
 from ipsys_log.app.report.rows import Rows, cm, counted, percent, wrap_text
+from ipsys_log.messages import Run
 from ipsys_log.statistics.accuracy import root_mean_square_m
 from ipsys_log.statistics.estimate_scores import FIRST_POSE, NONE, SE3, SIM3, YAW, EstimateScore, ScoreRow
-from ipsys_log.tools.comparison import Comparison
+from ipsys_log.statistics.path_alignment import sigma_name
+from ipsys_log.tools.comparison import Comparison, number_in
 from ipsys_log.units import CM_PER_M
 
 _ALIGNMENTS = {
@@ -33,17 +36,21 @@ def comparison_table(found: Comparison) -> Rows:
         own = row.space
         values_m = (root_mean_square_m(own), own.mean_m, own.median_m, own.p95_m, own.max_m)
         floor = cm(None if row.floor is None else root_mean_square_m(row.floor))
-        cells.append([name, str(own.count), *map(cm, values_m), floor, _degrees(row.heading_rmse_rad)])
-    heads = ["error", ">n", ">RMSE", ">mean", ">median", ">p95", ">max", ">2D RMSE", ">heading"]
-    return Rows(title(found), heads, cells, "Lengths in cm, in 3D; headings: RMSE in degrees")
+        cells.append([name, str(own.count), *map(cm, values_m), floor, _degrees(row.rotation_rmse_rad)])
+    heads = ["error", ">n", ">RMSE", ">mean", ">median", ">p95", ">max", ">2D RMSE", f">{found.score.turn}"]
+    note = f"Lengths in cm, in 3D; {found.score.turn}: RMSE in degrees"
+    return Rows(title(found), heads, cells, note)
 
 
 def title(found: Comparison) -> str:
     """Return what is scored against what."""
     parameters = found.record.parameters
     body = f" ({parameters['body']})" if parameters.get("body", found.robot) != found.robot else ""
+    # The same estimate can be scored with other options.
+    is_named = found.record.run == Path(parameters["file"]).stem.lower()
+    run = "" if is_named else f" (run {found.record.run})"
     return (
-        f"{parameters['file']}{body}: estimate of {found.robot}, against its tracks of run "
+        f"{parameters['file']}{body}{run}: estimate of {found.robot}, against its tracks of run "
         f"{', '.join(found.record.input_runs)} (the ground truth)"
     )
 
@@ -61,26 +68,36 @@ def _lines(found: Comparison) -> Iterator[str]:
     if found.score.tracks_m is not None:
         tracks = f"the tracks explain at most {cm(found.score.tracks_m)} cm of it"
     yield f"ATE {cm(root_mean_square_m(row.errors.absolute_3d))} cm, {_ALIGNMENTS[row.alignment]} ({tracks})."
-    yield f"Time offset: {_value(found, 'time_offset_s', 1, 's', 6)}, added to the times of the estimate."
-    if drift := _value(found, "clock_drift", _US_PER_S, "us/s", 1):
-        yield f"Drift of the clock: {drift}."
-    if pivot := _vector(found, "pivot_{}_m", CM_PER_M, "cm", 2):
-        yield f"Pivot, from the marker to the body: {pivot}."
-    if turn := _value(found, "body_turn_rad", _DEGREES, "deg", 2):
-        yield f"Turn, from the axes of the marker to those of the body: {turn}."
-    turns = _vector(found, "rotation_{}_rad", _DEGREES, "deg", 3)
-    shift = _vector(found, "translation_{}_m", CM_PER_M, "cm", 2)
-    if moved := "; ".join(
-        f"{name} {text}" for name, text in (("rotation", turns), ("translation", shift)) if text
-    ):
-        yield f"Alignment {parameters['align']}: {moved}."
-    if "axes" in parameters:
-        yield f"Axes of the estimate: {parameters['axes']}."
+    yield from alignment_lines(found.record, "the estimate", {"": ""})
     if found.with_scale:
-        yield f"Scale, applied: {_value(found, 'scale', 1, '', 5)}."
+        yield f"Scale, applied: {_value(found.record, 'scale', 1, '', 5)}."
     yield from _score_lines(found.score)
     for remark in parameters.get("remarks", "").splitlines():
         yield f"Remark on the alignment: {remark}."
+
+
+def alignment_lines(record: Run, what: str, bodies: Mapping[str, str]) -> Iterator[str]:
+    """Yield the clock, the bodies and the frames in the record of a run, with their standard deviations.
+
+    Parameters
+    ----------
+    bodies : by the start of the names of its parameters, a text that tells a body from the others.
+    """
+    offset = _value(record, "time_offset_s", 1, "s", 6) or "0 s"
+    yield f"Time offset: {offset}, added to the times of {what}."
+    if drift := _value(record, "clock_drift", _US_PER_S, "us/s", 1):
+        yield f"Drift of the clock: {drift}."
+    for start, name in bodies.items():
+        if pivot := _vector(record, start + "pivot_{}_m", CM_PER_M, "cm", 2):
+            yield f"Pivot{name}, from the marker to the body: {pivot}."
+        if turn := _value(record, f"{start}body_turn_rad", _DEGREES, "deg", 2):
+            yield f"Turn{name}, from the axes of the marker to those of the body: {turn}."
+    turns = _vector(record, "rotation_{}_rad", _DEGREES, "deg", 3)
+    shift = _vector(record, "translation_{}_m", CM_PER_M, "cm", 2)
+    parts = [f"{name} {text}" for name, text in (("rotation", turns), ("translation", shift)) if text]
+    yield f"Alignment {record.parameters['align']}{': ' * bool(parts)}{'; '.join(parts)}."
+    if "axes" in record.parameters:
+        yield f"Axes of {what}: {record.parameters['axes']}."
 
 
 def _score_lines(score: EstimateScore) -> Iterator[str]:
@@ -102,18 +119,25 @@ def _score_lines(score: EstimateScore) -> Iterator[str]:
         yield f"NEES: {score.nees:.2f} by degree of freedom on the floor (1 expected): {verdict} covariances."
 
 
-def _value(found: Comparison, name: str, factor: float, unit: str, digits: int) -> str:
+def _value(record: Run, name: str, factor: float, unit: str, digits: int) -> str:
     """Return a parameter with its sigma; empty if it is 0 and was not estimated."""
-    value, sigma = factor * found.number(name), factor * found.sigma(name)
-    if not (value or math.isfinite(sigma)):
+    value, sigma = (factor * number_in(record, one) for one in (name, sigma_name(name)))
+    if not (value or sigma):
         return ""
-    text = f"{value:.{digits}f} {unit}".strip()
-    return f"{text} (sigma {sigma:.{digits}f})" if math.isfinite(sigma) else text
+    return f"{value:.{digits}f} {unit}".strip() + (f" (sigma {sigma:.{digits}f})" if sigma else "")
 
 
-def _vector(found: Comparison, name: str, factor: float, unit: str, digits: int) -> str:
-    values = {axis: _value(found, name.format(axis), factor, unit, digits) for axis in "xyz"}
-    return ", ".join(f"{axis} {text}" for axis, text in values.items() if text)
+def _vector(record: Run, name: str, factor: float, unit: str, digits: int) -> str:
+    """Return the axes that were estimated or are not 0, with their sigmas together: 80 columns are narrow."""
+    names = {axis: name.format(axis) for axis in "xyz"}
+    rows = {
+        axis: [factor * number_in(record, one) for one in (text, sigma_name(text))]
+        for axis, text in names.items()
+    }
+    rows = {axis: row for axis, row in rows.items() if any(row)}
+    values = ", ".join(f"{axis} {value:.{digits}f}" for axis, (value, _) in rows.items())
+    sigmas = ", ".join(f"{sigma:.{digits}f}" if sigma else "-" for _, sigma in rows.values())
+    return f"{values} {unit}" * bool(rows) + f" (sigma {sigmas})" * any(sigma for _, sigma in rows.values())
 
 
 def _degrees(angle_rad: float | None) -> str:
@@ -122,15 +146,15 @@ def _degrees(angle_rad: float | None) -> str:
 
 def comparison_json(found: Comparison) -> dict[str, Any]:
     """Return a comparison as plain data, in SI units; the names of the alignment are those of its run."""
-    rows = found.score.rows()
+    rows, turn = found.score.rows(), found.score.turn
     return {
         **found.summary(),
-        "ate": {row.alignment: _row_json(row) for row in rows if row.alignment},
-        "rpe": [{"delta": row.delta, **_row_json(row)} for row in rows if row.delta],
+        "ate": {row.alignment: _row_json(row, turn) for row in rows if row.alignment},
+        "rpe": [{"delta": row.delta, **_row_json(row, turn)} for row in rows if row.delta],
     }
 
 
-def _row_json(row: ScoreRow) -> dict[str, Any]:
+def _row_json(row: ScoreRow, turn: str) -> dict[str, Any]:
     pairs = {"3d": row.space, "2d": row.floor}
     found = {name: {**plain(one), "rmse_m": root_mean_square_m(one)} for name, one in pairs.items() if one}
-    return {**found, **plain({"heading_rmse_rad": row.heading_rmse_rad})}
+    return {**found, **plain({f"{turn}_rmse_rad": row.rotation_rmse_rad})}

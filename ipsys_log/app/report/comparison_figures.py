@@ -26,7 +26,8 @@ def draw_comparisons(found: Sequence[Comparison], rig: Rig | None, path: Path) -
     _draw_paths(places["floor"], found, rig)
     _draw_errors(places["time"], found, "time")
     _draw_errors(places["distance"], found, "distance")
-    places["floor"].plot([], [], ":", color=NOTE, lw=0.8, label="expected error of the tracks")
+    if any(one.score.tracks_m is not None for one in found):
+        places["floor"].plot([], [], ":", color=NOTE, lw=0.8, label="expected error of the tracks")
     figure.legend(
         *places["floor"].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False
     )

@@ -80,6 +80,7 @@ class Track:
     rotation_rad: Vec3 | None = None
     pose_covariance: Mat66 | None = None
     angular_velocity_rad_s: Vec3 | None = None
+    angular_velocity_covariance_rad2_s2: Mat33 | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

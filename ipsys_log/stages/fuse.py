@@ -2,7 +2,6 @@
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
-from math import cos, sin
 from typing import Any
 
 from ipsys_log.errors import IpsysError
@@ -31,8 +30,7 @@ from ipsys_log.models.tracking.track_messages import (
     tracked_part,
 )
 from ipsys_log.models.tracking.tracks import FREE_BODIES, Pose, RobotTracks
-from ipsys_log.vision.bodies import track_rotation
-from ipsys_log.vision.poses import quaternion
+from ipsys_log.vision.bodies import track_quaternion
 
 
 class Fuse:
@@ -99,12 +97,8 @@ class Fuse:
 
 
 def _transform(track: Track, run: str, time_ns: int) -> FrameTransform:
-    if track.rotation_rad is not None:
-        turned = Quaternion(*quaternion(track_rotation(track)))
-    else:
-        # A transform must have a rotation; /runs/<run>/tracks shows that the heading is missing.
-        half_rad = (track.heading_rad or 0.0) / 2
-        turned = Quaternion(0.0, 0.0, sin(half_rad), cos(half_rad))
+    # A transform must have a rotation; /runs/<run>/tracks shows that a heading is missing.
+    turned = Quaternion(*track_quaternion(track))
     place = Vector3(track.x_m, track.y_m, track.z_m)
     return FrameTransform(time_ns, "world", f"{run}/{track.robot}", place, turned)
 

@@ -55,6 +55,7 @@ def tilted_track(robot: str) -> Track:
         rotation_rad=TILT_RAD,
         pose_covariance=pose,
         angular_velocity_rad_s=np.array([0.3, -0.4, 0.1]),
+        angular_velocity_covariance_rad2_s2=2 * pose[3:, 3:],
     )
 
 

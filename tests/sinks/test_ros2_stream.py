@@ -190,7 +190,8 @@ def test_tilted_robot_has_its_rotation_and_twist() -> None:
     covariance = np.reshape(odometry.twist.covariance, (6, 6))
     axes = map_from_robot.as_matrix()
     assert axes @ covariance[:3, :3] @ axes.T == pytest.approx(sent.velocity_covariance_m2_s2)
-    assert np.diag(covariance)[3:].tolist() == [1e6] * 3  # a track does not state them
+    turning = sent.angular_velocity_covariance_rad2_s2
+    assert axes @ covariance[3:, 3:] @ axes.T == pytest.approx(turning)
 
 
 def test_node_and_publishers_are_in_the_graph() -> None:

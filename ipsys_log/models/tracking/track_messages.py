@@ -308,11 +308,13 @@ def make_track(pose: Pose) -> Track:
     )
     if states.turns is None:
         return track
+    turning = slice(rates + 3, rates + 6)
     return replace(
         track,
         rotation_rad=rotation_vector(states.turns[row]),
         pose_covariance=covariance[:6, :6] if pose.has_covariance else None,
-        angular_velocity_rad_s=mean[rates + 3 : rates + 6],
+        angular_velocity_rad_s=mean[turning],
+        angular_velocity_covariance_rad2_s2=covariance[turning, turning] if pose.has_covariance else None,
     )
 
 

@@ -111,12 +111,13 @@ def _localize(pose: StreamPose, north_rad: float) -> _LocalPose:
             rates_rad_s = body_from_world @ velocity.angular_rad_s
         elif velocity.yaw_rad_s is not None:
             rates_rad_s[2] = -velocity.yaw_rad_s
-        known = velocity.covariance_m2_s2
+        known, turning = velocity.covariance_m2_s2, velocity.angular_covariance_rad2_s2
         # The uncertainty about the vertical gives none about the axes of a tilted robot.
         sigma_rad_s = velocity.yaw_sigma_rad_s if velocity.angular_rad_s is None else None
         velocity_covariance = _upper(
             None if known is None else body_from_world @ known @ body_from_world.T,
             nan if sigma_rad_s is None else sigma_rad_s,
+            None if turning is None else body_from_world @ turning @ body_from_world.T,
         )
     known, sigma_rad = pose.covariance_m2, pose.heading_sigma_rad
     covariance = _upper(
@@ -146,13 +147,16 @@ def _rpy_covariance(
     return _triangle(local @ known @ local.T)
 
 
-def _upper(known: Array | None, yaw_sigma: float) -> list[float]:
+def _upper(known: Array | None, yaw_sigma: float, turning: Array | None = None) -> list[float]:
     """Return the upper triangle of a covariance of 6 x 6; it begins with NaN if ``known`` is None.
 
     ``known`` (3, 3) is the part of x, y and z, and ``yaw_sigma`` the standard deviation about z. A level
     vehicle has the same about x and y: ArduPilot adds the three variances, and PX4 uses none if one is NaN.
+    ``turning`` (3, 3) is that about all axes of a free body.
     """
     covariance = np.diag(np.full(6, yaw_sigma**2))
+    if turning is not None:
+        covariance[3:, 3:] = turning
     covariance[:3, :3] = nan if known is None else known
     return _triangle(covariance)
 

@@ -43,8 +43,8 @@ class Velocity:
     """The velocity of a robot in m/s, and the rate of its heading in rad/s (None: headings are missing).
 
     ``covariance_m2_s2`` (3, 3) and ``yaw_sigma_rad_s`` are their uncertainties; None if these are unknown.
-    ``angular_rad_s`` (3,) is the angular velocity of a robot that is not level; all are in the axes of the
-    world.
+    ``angular_rad_s`` (3,) is the angular velocity of a robot that is not level, with the covariance
+    ``angular_covariance_rad2_s2`` (3, 3); all are in the axes of the world.
     """
 
     x_m_s: float
@@ -54,6 +54,7 @@ class Velocity:
     covariance_m2_s2: Mat33 | None = None
     yaw_sigma_rad_s: float | None = None
     angular_rad_s: Vec3 | None = None
+    angular_covariance_rad2_s2: Mat33 | None = None
 
     @property
     def turn_rad_s(self) -> Vec3:
@@ -266,7 +267,8 @@ class _Recent:
             return self._slope()
         x_m_s, y_m_s, z_m_s = newest.velocity_m_s.tolist()
         sigmas = _finite(newest.velocity_covariance_m2_s2), _finite(newest.turn_rate_sigma_rad_s)
-        turn = _finite(newest.turn_rate_rad_s), *sigmas, _finite(newest.angular_velocity_rad_s)
+        angular = newest.angular_velocity_rad_s, newest.angular_velocity_covariance_rad2_s2
+        turn = _finite(newest.turn_rate_rad_s), *sigmas, *map(_finite, angular)
         return Velocity(x_m_s, y_m_s, z_m_s, *turn)
 
     def _slope(self) -> Velocity | None:

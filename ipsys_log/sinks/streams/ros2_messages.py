@@ -164,8 +164,11 @@ def encode_odometry(pose: StreamPose, velocity: Velocity) -> bytes:
         None if known is None else body_from_map @ known @ body_from_map.T,
         velocity.yaw_sigma_rad_s if has_yaw else None,
     )
+    turning = velocity.angular_covariance_rad2_s2
+    if turning is not None:
+        covariance[3:, 3:] = body_from_map @ turning @ body_from_map.T
     twist = make(
-        "geometry_msgs/TwistWithCovariance", make("geometry_msgs/Twist", linear, angular), covariance
+        "geometry_msgs/TwistWithCovariance", make("geometry_msgs/Twist", linear, angular), covariance.ravel()
     )
     header = make_header(pose.time_ns, MAP)
     message = make("nav_msgs/Odometry", header, pose.track.robot, _pose(pose), twist)
@@ -176,14 +179,14 @@ def _pose(pose: StreamPose) -> Any:
     track = pose.track
     point = make("geometry_msgs/Point", track.x_m, track.y_m, track.z_m)
     where = make("geometry_msgs/Pose", point, make("geometry_msgs/Quaternion", *pose.quaternion))
-    covariance = _covariance(pose.covariance_m2, pose.heading_sigma_rad)
-    if pose.covariance is not None:
-        covariance = pose.covariance.ravel()
-    return make("geometry_msgs/PoseWithCovariance", where, covariance)
+    covariance = pose.covariance
+    if covariance is None:
+        covariance = _covariance(pose.covariance_m2, pose.heading_sigma_rad)
+    return make("geometry_msgs/PoseWithCovariance", where, covariance.ravel())
 
 
 def _covariance(known: NDArray[np.float64] | None, yaw_sigma: float | None) -> NDArray[np.float64]:
-    """Return a covariance of 6 x 6, row by row.
+    """Return a covariance (6, 6).
 
     ``known`` (3, 3) is the part of x, y and z, and ``yaw_sigma`` the standard deviation about z. All other
     variances are unknown.
@@ -193,7 +196,7 @@ def _covariance(known: NDArray[np.float64] | None, yaw_sigma: float | None) -> N
         covariance[:3, :3] = known
     if yaw_sigma is not None:
         covariance[5, 5] = yaw_sigma**2
-    return covariance.ravel()
+    return covariance
 
 
 def encode_poses(poses: Iterable[StreamPose]) -> Iterator[tuple[str, str, bytes]]:

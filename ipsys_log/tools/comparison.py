@@ -15,20 +15,23 @@ from ipsys_log.engine.request import Progress
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.location import LogLocation
-from ipsys_log.messages import IMPORTED, Array, Message, Run, Track, Tracks
+from ipsys_log.messages import IMPORTED, Array, Message, Rig, RigBody, Run, Track, Tracks
 from ipsys_log.messages.channels import ESTIMATE, TRACKS
 from ipsys_log.models.tracking.track_messages import gather_rows
 from ipsys_log.statistics.accuracy import root_mean_square_m
 from ipsys_log.statistics.estimate_scores import EstimateFrame, EstimateScore, score_estimate
 from ipsys_log.statistics.ground_truth import gather_paths
-from ipsys_log.statistics.path_alignment import PathAlignment
+from ipsys_log.statistics.path_alignment import PathAlignment, sigma_name
 from ipsys_log.tools.estimates import Body, CompareOptions, TrackedRobots, align_body, read_estimates
 from ipsys_log.units import NS_PER_S
-from ipsys_log.vision.poses import rotation, rotation_vector
+from ipsys_log.vision.bodies import pose_from_rpy, rpy_from_rotation
+from ipsys_log.vision.poses import make_pose, rotation, rotation_vector
 
 # Poses of an estimate this long before and after the tracks are stored, too.
 _MARGIN_NS = NS_PER_S
 _LONGEST_NAME = 40
+# A pivot with a larger standard deviation is not determined.
+_MOST_SIGMA_M = 0.03
 # Parameters that are no numbers.
 _TEXTS = {
     *("format", "file", "file_sha256", "body", "robot", "align", "axes", "remarks", "with_scale"),
@@ -104,6 +107,51 @@ def number_in(record: Run, name: str) -> float:
 def _vector(record: Run, name: str) -> Array:
     """Return the three parameters of a name such as ``pivot_{}_m``."""
     return np.array([number_in(record, name.format(axis)) for axis in "xyz"])
+
+
+def move_pivot(rig: Rig, found: Comparison, tracked: Rig | None) -> Rig:
+    """Return a rig whose tracks of a robot are those of the body of an estimate.
+
+    Parameters
+    ----------
+    rig : the rig to change.
+    found : the comparison, with the pivot and the turn of the body relative to the tracks.
+    tracked : the rig of these tracks.
+
+    Raises
+    ------
+    IpsysError
+        The drive does not determine the pivot, the rig does not have the robot, or it has another pivot than
+        the tracks.
+    """
+    robot, values = found.robot, found.record.parameters
+    sigmas_m = [values.get(sigma_name(f"pivot_{axis}_m")) for axis in "xy"]
+    if not {"pivot_x_m", "pivot_y_m"} & values.keys() or any(
+        float(one or 0) > _MOST_SIGMA_M for one in sigmas_m
+    ):
+        raise IpsysError(
+            f"the drive of {robot} does not determine its pivot; drive curves at different speeds, or give "
+            "--pivot"
+        )
+    heights_m = rig.robot_heights_m()
+    if robot not in heights_m:
+        raise IpsysError(f"the rig has no robot {robot}; name it in [[markers]]")
+    bodies = {body.robot: body for body in rig.bodies}
+    own = bodies.get(robot, RigBody(robot, level=heights_m[robot] is not None))
+    used = next((one for one in tracked.bodies if one.robot == robot), None) if tracked else None
+    old = pose_from_rpy(own.pivot_m, own.pivot_rpy_rad)
+    if not np.allclose(old, pose_from_rpy(used.pivot_m, used.pivot_rpy_rad) if used else np.eye(4)):
+        raise IpsysError(
+            f"the tracks of {robot} have another pivot than the rig; replay the log with it first"
+        )
+    pivot_m = np.array([float(values.get(f"pivot_{axis}_m", 0.0)) for axis in "xyz"])
+    turn = rotation(np.array([0.0, 0.0, float(values.get("body_turn_rad", 0.0))]))
+    new = old @ make_pose(turn, pivot_m)
+    numbers = (
+        tuple(round(one, 6) for one in part) for part in (new[:3, 3].tolist(), rpy_from_rotation(new[:3, :3]))
+    )
+    bodies[robot] = replace(own, **dict(zip(("pivot_m", "pivot_rpy_rad"), numbers, strict=True)))
+    return replace(rig, bodies=tuple(bodies.values()))
 
 
 def compare(

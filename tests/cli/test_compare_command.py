@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from decimal import Decimal
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from ipsys_log.exchange.trajectory_files import TrajectoryFile
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import IMPORTED, RIG_TOPIC, Message, Run, Track, Tracks
 from ipsys_log.messages.channels import ESTIMATE, RECORD
+from ipsys_log.messages.rig_file import load_rig, rig_toml
 from ipsys_log.statistics.path_alignment import PathAlignment, align_trajectories
 from ipsys_log.statistics.trajectories import Trajectory, TrajectoryPair
 from ipsys_log.tools import estimates
@@ -269,6 +271,25 @@ def test_wrong_estimate_is_one_line_and_changes_nothing(
     error = done.err.splitlines()[-1]
     assert message in error, error
     assert log.read_bytes() == before
+
+
+def test_pivot_is_written_into_the_rig_and_keeps_its_comments(
+    log: Path, tmp_path: Path, ipsys: Ipsys
+) -> None:
+    estimate, path = write_tum(tmp_path / "odom.tum", log), tmp_path / "lab.toml"
+    path.write_text("# our lab\n" + rig_toml(LAB))
+    given = ("compare", log, estimate, "--robot", "ada", "--write", path)
+    assert ipsys(*given).code == 0
+    (body,) = load_rig(path).bodies
+    assert (body.robot, body.level) == ("ada", LAB.marker_height_m is not None)
+    assert body.pivot_m[:2] == pytest.approx(PIVOT_M[:2], abs=0.02)
+    assert path.read_text().startswith("# our lab")
+    # The tracks of the log are those of the marker, and not of this pivot.
+    again = ipsys(*given)
+    assert again.code == 1
+    assert "the tracks of ada have another pivot than the rig" in again.err
+    path.write_text(rig_toml(replace(LAB, markers=())))
+    assert "the rig has no robot ada" in ipsys(*given).err
 
 
 def test_log_without_tracks_or_comparisons_says_so(log: Path, tmp_path: Path, ipsys: Ipsys) -> None:

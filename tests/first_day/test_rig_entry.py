@@ -217,7 +217,7 @@ def test_text_that_means_another_rig_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "lab.toml"
     text = '"name" = "lab"\ndictionary = "DICT_4X4_100"\nmarker_length_m = 0.2\n'
     path.write_text(text)
-    with pytest.raises(IpsysError, match="cannot change its layout"):
+    with pytest.raises(IpsysError, match="its layout is unusual"):
         write_rig(path, text, replace(load_rig(path), name="hall"))
     assert path.read_text() == text
 

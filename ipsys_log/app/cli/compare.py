@@ -40,6 +40,7 @@ _OPTIONS: dict[str, cli.Option] = {
     "scale": flag("--scale", "Estimate and apply a scale, as for monocular SLAM."),
     "time_unit": option(str | None, "--time-unit", "s|ns", "Unit of a time column whose header has none."),
     "length_unit": option(str | None, "--length-unit", "m|mm", "Unit of x, y and z whose header has none."),
+    "write": option(Path | None, "--write", "FILE", "Write the pivot of the robot into this rig file."),
     "plot": (Annotated[Path | None, figure_option("paths, and errors over time and distance")], None),
     "output": (Annotated[Path | None, log_option(help="A new log for the results.")], None),
     "as_json": (cli.AsJson, False),
@@ -50,6 +51,7 @@ _OPTIONS: dict[str, cli.Option] = {
 def compare(
     log: Any,
     estimates: list[Path] | None,
+    write: Path | None,
     plot: Path | None,
     output: Path | None,
     as_json: bool,
@@ -70,6 +72,7 @@ def compare(
     from ipsys_log.app.report.comparison import comparison_json, comparison_lines, comparison_table
     from ipsys_log.engine.output import choose_target
     from ipsys_log.log.dataset import Session
+    from ipsys_log.messages.rig_file import load_rig
     from ipsys_log.sinks.selection import rig_in_force
     from ipsys_log.tools import comparison as tool
 
@@ -82,7 +85,9 @@ def compare(
                 found = tool.compare(session, estimates, options, say, progress)
         elif not (found := tool.read_comparisons(session, options.run)):
             raise IpsysError(f"{session}: has no comparison; name a file with an estimate")
-        rig = rig_in_force(session, [one.record.run for one in found])
+        rig = rig_in_force(
+            session, [run for one in found for run in (one.record.run, *one.record.input_runs)]
+        )
     written = tool.append_comparisons(logs, target, found)
     parts = [part for one in found for part in (comparison_table(one), *comparison_lines(one), "")]
     print_result({"comparisons": [comparison_json(one) for one in found]}, parts[:-1], as_json)
@@ -91,6 +96,17 @@ def compare(
 
         draw_comparisons(found, rig, plot)
         say(f"{plot} drawn")
+    if write is not None:
+        from ipsys_log.app.first_day.rig_entry import replace_tables, write_rig
+
+        changed = load_rig(write)
+        for one in found:
+            changed = tool.move_pivot(changed, one, rig)
+        write_rig(
+            write, replace_tables(write.read_text(encoding="utf-8"), "[[bodies]]", changed.bodies), changed
+        )
+        robots = ", ".join(sorted({one.robot for one in found}))
+        say(f"{write}: has the pivot of {robots}; replay with --rig {write}")
     for one in found if estimates else ():
         state = "has it already" if one.is_stored else f"written to {written}"
         say(f"run {one.record.run} {state}")

@@ -367,7 +367,7 @@ def write_rig(path: Path, text: str, expected: Rig) -> None:
         except IpsysError as error:
             raise IpsysError(str(error).replace(str(draft), path.name)) from error
     if rig != expected:
-        raise IpsysError(f"{path.name}: this page cannot change its layout; edit it in a text editor")
+        raise IpsysError(f"{path.name}: its layout is unusual; edit it in a text editor")
     with replacement_of(path) as file:
         file.write(text.encode())
 

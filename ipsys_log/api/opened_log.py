@@ -295,8 +295,7 @@ class Log:
         from ipsys_log.messages.rig_file import load_rig
         from ipsys_log.tools.carried_body import calibrate_carried_body
 
-        given = load_rig(Path(rig)) if rig else None
-        return calibrate_carried_body(self._session, robot, given)[0]
+        return calibrate_carried_body(self._session, robot, load_rig(Path(rig)) if rig else None)[0]
 
     def export(
         self,
@@ -318,8 +317,7 @@ class Log:
         ----------
         path : ``.csv`` or ``.parquet`` for the table; ``.tum`` or ``.kitti`` for the trajectory of a robot;
             ``.mcap`` for a ROS 2 bag; ``.mp4`` for a video; a new folder for a COCO data set.
-        table, run : as for :meth:`table`; only a table may have several runs.
-        robot : only this robot.
+        table, run, robot : as for :meth:`table`, only this robot; only a table may have several runs.
         format : ``csv``, ``parquet``, ``tum``, ``kitti``, ``ros2``, ``mp4`` or ``coco``; None: by the suffix.
         with_images : put the images into a bag.
         rate_hz, size_px : frames per second, and width and height, of a video.

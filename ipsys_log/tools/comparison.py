@@ -147,10 +147,9 @@ def move_pivot(rig: Rig, found: Comparison, tracked: Rig | None) -> Rig:
     pivot_m = np.array([float(values.get(f"pivot_{axis}_m", 0.0)) for axis in "xyz"])
     turn = rotation(np.array([0.0, 0.0, float(values.get("body_turn_rad", 0.0))]))
     new = old @ make_pose(turn, pivot_m)
-    numbers = (
-        tuple(round(one, 6) for one in part) for part in (new[:3, 3].tolist(), rpy_from_rotation(new[:3, :3]))
-    )
-    bodies[robot] = replace(own, **dict(zip(("pivot_m", "pivot_rpy_rad"), numbers, strict=True)))
+    pivot = tuple(round(one, 6) for one in new[:3, 3].tolist())
+    rpy_rad = tuple(round(one, 6) for one in rpy_from_rotation(new[:3, :3]))
+    bodies[robot] = replace(own, pivot_m=pivot, pivot_rpy_rad=rpy_rad)
     return replace(rig, bodies=tuple(bodies.values()))
 
 

@@ -267,9 +267,8 @@ class _Recent:
             return self._slope()
         x_m_s, y_m_s, z_m_s = newest.velocity_m_s.tolist()
         sigmas = _finite(newest.velocity_covariance_m2_s2), _finite(newest.turn_rate_sigma_rad_s)
-        angular = newest.angular_velocity_rad_s, newest.angular_velocity_covariance_rad2_s2
-        turn = _finite(newest.turn_rate_rad_s), *sigmas, *map(_finite, angular)
-        return Velocity(x_m_s, y_m_s, z_m_s, *turn)
+        turn = _finite(newest.turn_rate_rad_s), *sigmas, _finite(newest.angular_velocity_rad_s)
+        return Velocity(x_m_s, y_m_s, z_m_s, *turn, _finite(newest.angular_velocity_covariance_rad2_s2))
 
     def _slope(self) -> Velocity | None:
         """Return the slope of the poses; None if the poses are too few, or their time is too short."""

@@ -136,7 +136,7 @@ class PathAlignment:
     def record_parameters(self, prefixes: Sequence[str] = ("",)) -> dict[str, str]:
         """Return clock, frames and bodies for the record of a run, with all digits, and their sigmas.
 
-        What changes no pose and was not estimated is left out. The names of a body have its prefix.
+        Values that change no pose and were not estimated are left out. The names of a body have its prefix.
         """
         values = {
             "time_offset_s": (0.0, self.offset_sigma_s),

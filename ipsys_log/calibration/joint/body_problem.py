@@ -27,6 +27,8 @@ from ipsys_log.vision.poses import cross, rotate, rotation_vectors
 
 # Relative standard deviations of printed sides: of all prints of a printer, and of one print.
 PRINT_SIGMA, SIDE_SIGMA = 0.002, 0.001
+# Far above the usual ones: a prior that holds back a motion holds back the size of the body, which scales it.
+_TWIST_SIGMAS = 10 * TWIST_SIGMAS
 # The usual acceleration of a carried body between two frames, per axis.
 _ACCELERATIONS = np.repeat([4.0, 20.0], 3)  # in m/s^2 and rad/s^2
 # Poses by two calibrated cameras differ by about this much, in m and rad.
@@ -209,8 +211,8 @@ class BodyProblem:
         """Yield the residuals of the motion and of the prints."""
         frames, last = len(self.frames), self.kept[-1:]
         columns = np.arange(0, self.shared, _TWIST)[:, None] + np.arange(_POSE, _TWIST)
-        slopes = np.tile(np.diag(1 / TWIST_SIGMAS), (frames, 1, 1))
-        yield _Block(now.twists / TWIST_SIGMAS, columns, slopes, np.inf)
+        slopes = np.tile(np.diag(1 / _TWIST_SIGMAS), (frames, 1, 1))
+        yield _Block(now.twists / _TWIST_SIGMAS, columns, slopes, np.inf)
         odd = (now.log_sides - np.log(self.lengths_m) - now.log_print) / SIDE_SIGMA
         columns = np.column_stack(np.broadcast_arrays(np.arange(self.shared + _POSE, last[0], MARKER), last))
         slopes = np.tile([1.0, -1.0], (len(odd), 1, 1)) / SIDE_SIGMA

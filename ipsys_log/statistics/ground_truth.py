@@ -294,8 +294,10 @@ def pose_pairs(track: TrackedPath, truth: TrackedPath) -> PosePairs:
     if track.rotations_rad is not None and truth.rotations_rad is not None:
         axes, true_axes = rotate(track.rotations_rad[rows]), truth.axes_at(times_ns[is_known])
     else:
-        axes, true_axes = about_z(track.headings_rad[rows]), about_z(truth.headings_rad)
-        true_axes = _mix_axes(brackets, true_axes)[is_known]
+        # Most commands turn nothing about other axes, and scipy takes long to load.
+        start_rad, end_rad = truth.headings_rad[brackets.before], truth.headings_rad[brackets.after]
+        true_rad = start_rad + brackets.share * wrap_angles(end_rad - start_rad)
+        axes, true_axes = about_z(track.headings_rad[rows]), about_z(true_rad[is_known])
     true_m = brackets.mix(truth.positions.points_m)[is_known]
     return PosePairs(times_ns[is_known], track.positions.points_m[rows], axes, true_m, true_axes)
 

@@ -255,7 +255,7 @@ def export(
         ipsys export monday.mcap -o tracks.csv
         ipsys export monday.mcap -o tracks.parquet --run poly --run best
         ipsys export monday.mcap -o robot.tum --robot robot_0    # for evo
-        ipsys export monday.mcap -o r.tum --robot robot_0 --trim   # evo_ape tum r_truth.tum r.tum
+        ipsys export monday.mcap -o r.tum --robot robot_0 --trim   # for evo_ape
         ipsys export monday.mcap -o bag.mcap --format ros2       # with images
         ipsys export monday.mcap -o view.mp4 --size 1920x1080
         ipsys export monday.mcap -o markers --format coco        # a new folder

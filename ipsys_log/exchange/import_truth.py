@@ -19,14 +19,14 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages import IMPORTED, RIG_TOPIC, TRUTH_TOPIC, Message, Rig, Run, Track, Tracks
 from ipsys_log.messages.channels import RIG, TRACKS, TRUTH
 from ipsys_log.messages.rig_file import check_robots
-from ipsys_log.statistics.ground_truth import LONGEST_GAP_NS, TrackedPath, about_z, gather_paths, last_poses
+from ipsys_log.statistics.ground_truth import LONGEST_GAP_NS, TrackedPath, gather_paths, last_poses
 from ipsys_log.statistics.path_alignment import PathAlignment, Residuals, align_trajectories, seconds_text
 from ipsys_log.statistics.path_cleaning import select_rows
 from ipsys_log.statistics.path_pairs import PathPair, common_instants
 from ipsys_log.statistics.path_problem import ALIGNMENTS
 from ipsys_log.statistics.trajectories import KnownParts, Trajectory, TrajectoryPair
 from ipsys_log.units import NS_PER_S, format_time
-from ipsys_log.vision.poses import rotation_vector
+from ipsys_log.vision.poses import rotation_vector, turns_about_z
 from ipsys_log.vision.time_brackets import bracket_times
 
 _RUN = "truth"
@@ -259,13 +259,13 @@ def _marker_poses(alignment: PathAlignment, number: int, track: TrackedPath) -> 
     from scipy.spatial.transform import Rotation
 
     poses, body = alignment.poses[number], alignment.bodies[number]
-    axes, quaternions = poses.axes @ about_z(np.array([-body.turn_rad])), poses.quaternions.copy()
+    axes, quaternions = poses.axes @ turns_about_z(np.array([-body.turn_rad])), poses.quaternions.copy()
     is_turned = np.isfinite(axes).all(axis=(1, 2))
     if is_turned.any():
         quaternions[is_turned] = Rotation.from_matrix(axes[is_turned]).as_quat()
     brackets = bracket_times(track.positions.times_ns, poses.times_ns, LONGEST_GAP_NS)
     rest = ~is_turned & brackets.is_known
-    axes[rest] = about_z(brackets.mix(np.asarray(np.unwrap(np.nan_to_num(track.headings_rad))))[rest])
+    axes[rest] = turns_about_z(brackets.mix(np.asarray(np.unwrap(np.nan_to_num(track.headings_rad))))[rest])
     points_m = poses.points_m - (axes @ body.pivot_m if body.pivot_m.any() else 0.0)
     known = np.asarray(np.isfinite(points_m).all(axis=1))
     return select_rows(replace(poses, points_m=points_m, quaternions=quaternions), known)

@@ -21,7 +21,8 @@ from ipsys_log.models.tracking.frame_reader import FREE_MODES
 from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.bodies import BodyShape, body_shapes
 from ipsys_log.vision.lenses import undistort
-from ipsys_log.vision.poses import rotation_vector
+from ipsys_log.vision.poses import rotate, rotation_vector, rotation_vectors
+from ipsys_log.vision.square_pose import is_convex
 
 # The number of modes of the calibration that positions keep. The errors by the others, 0.07 mm after 75
 # calibration points, count as noise.
@@ -44,10 +45,10 @@ class _Seen:
     def time_ns(self) -> int:
         return sum(self.times_ns) // len(self.times_ns)
 
-    def without(self, number: int) -> _Seen:
-        """Return the body without one of its markers."""
-        rest = [n for n in range(len(self.markers)) if n != number]
-        return _Seen(self.shape, [self.markers[n] for n in rest], [self.times_ns[n] for n in rest])
+    def of(self, markers: Sequence[Marker]) -> _Seen:
+        """Return the body with some of its markers."""
+        times_ns = [at for marker, at in zip(self.markers, self.times_ns, strict=True) if marker in markers]
+        return _Seen(self.shape, list(markers), times_ns)
 
 
 @dataclass(slots=True, eq=False)
@@ -83,36 +84,43 @@ class BodyLocator:
         bodies: dict[str, _Seen] = {}
         for marker, exposed_ns in zip(markers, times_ns, strict=True):
             shape = self.shapes[marker.id]
-            if marker.id in shape.corners_m and self._is_in_view(camera, marker):
+            if marker.id in shape.corners_m and self._is_square(camera, marker):
                 seen = bodies.setdefault(shape.robot, _Seen(shape, [], []))
                 seen.markers.append(marker)
                 seen.times_ns.append(exposed_ns)
         by_count: dict[int, list[_Seen]] = {}
         for seen in bodies.values():
-            by_count.setdefault(len(seen.markers), []).append(seen)
+            # Beside fewer than two others, nothing tells whether a loose marker is at its place again.
+            firm = [marker for marker in seen.markers if self.loose.get(marker.id, 0) < _LOOSE_FRAMES]
+            kept = seen if len(seen.markers) > 2 else seen.of(firm)
+            if kept.markers:
+                by_count.setdefault(len(kept.markers), []).append(kept)
         for together in by_count.values():
             poses = self._solve(camera, together)
             for row, seen in enumerate(together):
                 yield from self._results(camera, time_ns, seen, poses, row)
 
-    def _is_in_view(self, camera: str, marker: Marker) -> bool:
-        uv = undistort(np.asarray(marker.corners_px, dtype=np.float64), self.cameras[camera].calibration)
-        return bool(np.isfinite(uv).all())
+    def _is_square(self, camera: str, marker: Marker) -> bool:
+        """Return whether the camera can see these corners of a square; a log may hold others."""
+        corners_px = np.asarray(marker.corners_px, dtype=np.float64)
+        return is_convex(undistort(corners_px, self.cameras[camera].calibration))
 
     def _results(
         self, camera: str, time_ns: int, seen: _Seen, poses: BodyPoses, row: int
     ) -> Iterator[Position | Event]:
-        fits = poses.chi2[row] < _most_chi2(8 * len(seen.markers) - 6)
-        if not fits and len(seen.markers) > 2:
-            parts = [seen.without(number) for number in range(len(seen.markers))]
+        excess = _excess(poses, row, len(seen.markers))
+        if excess > 1 and len(seen.markers) > 1:
+            parts = [seen.of([one for one in seen.markers if one is not odd]) for odd in seen.markers]
             others = self._solve(camera, parts)
             best = int(others.chi2.argmin())
-            if others.chi2[best] < _most_chi2(8 * len(seen.markers) - 14):
+            if len(seen.markers) > 2 and _excess(others, best, len(seen.markers) - 1) == 1:
                 yield from self._note(camera, time_ns, seen, seen.markers[best].id)
-                seen, poses, row, fits = parts[best], others, best, True
-        for marker in seen.markers if fits else ():
+                seen, poses, row, excess = parts[best], others, best, 1.0
+            else:
+                excess = max(excess, _disagreement(poses, row, others))
+        for marker in seen.markers if excess == 1 else ():
             self.loose.pop(marker.id, None)
-        yield self._position(camera, time_ns, seen, poses, row, fits=bool(fits))
+        yield self._position(camera, time_ns, seen, poses, row, excess)
 
     def _note(self, camera: str, time_ns: int, seen: _Seen, marker_id: int) -> Iterator[Event]:
         frames = self.loose[marker_id] = self.loose.get(marker_id, 0) + 1
@@ -148,14 +156,17 @@ class BodyLocator:
         return locate_bodies(model, sightings)
 
     def _position(
-        self, camera: str, time_ns: int, seen: _Seen, poses: BodyPoses, row: int, *, fits: bool
+        self, camera: str, time_ns: int, seen: _Seen, poses: BodyPoses, row: int, excess: float
     ) -> Position:
-        """Return the position with its noise, and its errors by modes, by the size and by the clock."""
+        """Return the position with its noise, and its errors by modes, by the size and by the clock.
+
+        The variances of the noise grow by a factor ``excess`` if the corners contradict the body.
+        """
         model, shape = self.cameras[camera], seen.shape
         all_modes, turn = poses.modes[row], poses.turns[row]
         kept = all_modes @ self.axes
         others = all_modes @ all_modes.T - kept @ kept.T
-        noise, spread = poses.noise[row] + others, poses.spread[row] + others
+        noise, spread = excess * poses.noise[row] + others, excess * poses.spread[row] + others
         by_scale = poses.by_scale[row][:, None] * shape.scale_sigma
         clock_s = np.append(model.modes[len(model.lens) + 7] @ self.axes, 0.0)
         modes = np.vstack([np.hstack([kept, by_scale]), clock_s])
@@ -169,7 +180,7 @@ class BodyLocator:
             z_m,
             heading_rad,
             spread[:3, :3] + modes[:3] @ modes[:3].T,
-            fits and model.is_certain and not any(marker.contradicted for marker in seen.markers),
+            excess == 1 and model.is_certain and not any(marker.contradicted for marker in seen.markers),
             seen.time_ns - time_ns or None,
             spread[:3, :3],
             float(np.sqrt(spread[5, 5])),
@@ -181,6 +192,28 @@ class BodyLocator:
         )
 
 
-def _most_chi2(degrees: int) -> float:
+def _excess(poses: BodyPoses, row: int, markers: int) -> float:
+    """Return the factor by which the corners contradict their noise; 1 for usual residuals."""
+    degrees = 8 * markers - 6
     share = 2 / (9 * degrees)
-    return float(degrees * (1 - share + _RARE * np.sqrt(share)) ** 3)
+    if poses.chi2[row] < degrees * (1 - share + _RARE * np.sqrt(share)) ** 3:
+        return 1.0
+    return float(max(1.0 + _RARE * np.sqrt(share), poses.still_chi2[row] / degrees))
+
+
+def _disagreement(poses: BodyPoses, row: int, others: BodyPoses) -> float:
+    """Return the largest squared difference from poses without one marker, by degree of freedom.
+
+    If the markers contradict each other, and nothing tells which one is wrong, each of these may be right.
+    """
+    turns = rotate(np.concatenate([poses.to_still[row][None], others.to_still])[:, 3:])
+    turns = turns @ np.concatenate([poses.turns[row][None], others.turns])
+    apart = np.concatenate(
+        [
+            others.points_m + others.to_still[:, :3] - poses.points_m[row] - poses.to_still[row, :3],
+            rotation_vectors(turns[1:] @ turns[0].T),
+        ],
+        axis=1,
+    )
+    solved = np.linalg.solve(poses.noise[row], apart.T).T
+    return float((apart * solved).sum(axis=1).max()) / 6

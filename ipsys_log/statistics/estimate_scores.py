@@ -13,13 +13,12 @@ from ipsys_log.statistics.ground_truth import (
     PosePairs,
     RelativeErrors,
     TrajectoryErrors,
-    about_z,
     relative_errors,
     turns_between,
 )
 from ipsys_log.statistics.path_pairs import gap_limit_s
 from ipsys_log.units import NS_PER_S
-from ipsys_log.vision.poses import rotation_between
+from ipsys_log.vision.poses import rotation_between, turns_about_z
 from ipsys_log.vision.time_brackets import bracket_times
 
 # Alignments of an estimate before its absolute error, in the order of the table.
@@ -179,7 +178,10 @@ def score_estimate(
     """
     limit_ns = gap_limit_s(tracks.times_ns / NS_PER_S) * NS_PER_S
     samples = interpolate(tracks, estimate.times_ns)
-    own_axes, true_axes = rotations or (about_z(estimate.headings_rad), about_z(samples.headings_rad))
+    own_axes, true_axes = rotations or (
+        turns_about_z(estimate.headings_rad),
+        turns_about_z(samples.headings_rad),
+    )
     lever_m = _lever_m(true_axes, frame.pivot_m)
     cov_m2 = samples.covariances_m2 + _turned_by(lever_m, samples.heading_sigmas_rad)
     known = bracket_times(tracks.times_ns, estimate.times_ns, limit_ns).is_known
@@ -188,7 +190,7 @@ def score_estimate(
         raise IpsysError(
             f"{where}: fewer than {LEAST_POSES} poses are at the times of the tracks; check --time-offset"
         )
-    yaw, turn = about_z(np.array([frame.yaw_rad, frame.turn_rad]))
+    yaw, turn = turns_about_z(np.array([frame.yaw_rad, frame.turn_rad]))
     pairs = PosePairs(
         estimate.times_ns,
         (estimate.points_m - frame.shift_m) @ yaw / frame.scale,
@@ -249,7 +251,7 @@ def _aligned(pairs: PosePairs, kind: str, is_level: bool) -> AlignedErrors | Non
     points_m = scale * pairs.points_m @ rotation.T + shift_m
     axes = rotation @ pairs.axes
     if is_level:  # the alignment may tilt it
-        axes = about_z(np.arctan2(axes[:, 1, 0], axes[:, 0, 0]))
+        axes = turns_about_z(np.arctan2(axes[:, 1, 0], axes[:, 0, 0]))
     turns_rad = turns_between(axes, pairs.true_axes)
     return AlignedErrors(kind, scale, points_m, TrajectoryErrors("", points_m - pairs.true_m, ()), turns_rad)
 
@@ -267,7 +269,7 @@ def _fit(points_m: Array, true_m: Array, kind: str) -> tuple[float, Array, Array
 def _coverage(times_ns: Times, tracks: TrackRows, pivot_m: Array) -> Coverage:
     limit_ns = gap_limit_s(times_ns / NS_PER_S) * NS_PER_S
     covered = bracket_times(times_ns, tracks.times_ns, limit_ns).is_known
-    places_m = tracks.points_m + _lever_m(about_z(tracks.headings_rad), pivot_m)
+    places_m = tracks.points_m + _lever_m(turns_about_z(tracks.headings_rad), pivot_m)
     placed = np.isfinite(places_m).all(axis=1)
     cells = np.floor(places_m[:, :2] / CELL_M)
     areas = [len(np.unique(cells[mask], axis=0)) for mask in (placed & covered, placed)]

@@ -13,7 +13,7 @@ from ipsys_log.statistics.accuracy import error_statistics
 from ipsys_log.statistics.calibration_points import TimedPoints, still_interval
 from ipsys_log.statistics.tape import RiggedMeasurement
 from ipsys_log.units import NS_PER_S
-from ipsys_log.vision.poses import rotate
+from ipsys_log.vision.poses import rotate, turns_about_z
 from ipsys_log.vision.time_brackets import TimeBrackets, bracket_times
 
 _SAME_HEIGHT_M = 0.005
@@ -297,7 +297,7 @@ def pose_pairs(track: TrackedPath, truth: TrackedPath) -> PosePairs:
         # Most commands turn nothing about other axes, and scipy takes long to load.
         start_rad, end_rad = truth.headings_rad[brackets.before], truth.headings_rad[brackets.after]
         true_rad = start_rad + brackets.share * wrap_angles(end_rad - start_rad)
-        axes, true_axes = about_z(track.headings_rad[rows]), about_z(true_rad[is_known])
+        axes, true_axes = turns_about_z(track.headings_rad[rows]), turns_about_z(true_rad[is_known])
     true_m = brackets.mix(truth.positions.points_m)[is_known]
     return PosePairs(times_ns[is_known], track.positions.points_m[rows], axes, true_m, true_axes)
 
@@ -313,13 +313,6 @@ def _mix_axes(brackets: TimeBrackets, axes: Array) -> Array:
         turns = Rotation.from_matrix(start[known].swapaxes(1, 2) @ end[known]).as_rotvec()
         found[known] = start[known] @ rotate(brackets.share[known, None] * turns)
     return found
-
-
-def about_z(angles_rad: Array) -> Array:
-    """Return rotations (n, 3, 3) by angles (n,) about the vertical."""
-    cos, sin, none = np.cos(angles_rad), np.sin(angles_rad), 0.0 * angles_rad
-    rows = [[cos, -sin, none], [sin, cos, none], [none, none, none + 1.0]]
-    return np.moveaxis(np.array(rows), 2, 0)
 
 
 def turns_between(first: Array, second: Array) -> Array:

@@ -21,7 +21,7 @@ from ipsys_log.models.tracking.track_messages import gather_rows
 from ipsys_log.statistics.accuracy import root_mean_square_m
 from ipsys_log.statistics.estimate_scores import EstimateFrame, EstimateScore, score_estimate
 from ipsys_log.statistics.ground_truth import gather_paths
-from ipsys_log.statistics.path_alignment import PathAlignment, sigma_name
+from ipsys_log.statistics.path_alignment import PathAlignment
 from ipsys_log.tools.estimates import Body, CompareOptions, TrackedRobots, align_body, read_estimates
 from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.bodies import pose_from_rpy, rpy_from_rotation
@@ -30,8 +30,6 @@ from ipsys_log.vision.poses import make_pose, rotation, rotation_vector
 # Poses of an estimate this long before and after the tracks are stored, too.
 _MARGIN_NS = NS_PER_S
 _LONGEST_NAME = 40
-# A pivot with a larger standard deviation is not determined.
-_MOST_SIGMA_M = 0.03
 # Parameters that are no numbers.
 _TEXTS = {
     *("format", "file", "file_sha256", "body", "robot", "align", "axes", "remarks", "with_scale"),
@@ -124,11 +122,8 @@ def move_pivot(rig: Rig, found: Comparison, tracked: Rig | None) -> Rig:
         The drive does not determine the pivot, the rig does not have the robot, or it has another pivot than
         the tracks.
     """
-    robot, values = found.robot, found.record.parameters
-    sigmas_m = [values.get(sigma_name(f"pivot_{axis}_m")) for axis in "xy"]
-    if not {"pivot_x_m", "pivot_y_m"} & values.keys() or any(
-        float(one or 0) > _MOST_SIGMA_M for one in sigmas_m
-    ):
+    robot, record = found.robot, found.record
+    if not {"pivot_x_m", "pivot_y_m"} & record.parameters.keys():
         raise IpsysError(
             f"the drive of {robot} does not determine its pivot; drive curves at different speeds, or give "
             "--pivot"
@@ -144,9 +139,8 @@ def move_pivot(rig: Rig, found: Comparison, tracked: Rig | None) -> Rig:
         raise IpsysError(
             f"the tracks of {robot} have another pivot than the rig; replay the log with it first"
         )
-    pivot_m = np.array([float(values.get(f"pivot_{axis}_m", 0.0)) for axis in "xyz"])
-    turn = rotation(np.array([0.0, 0.0, float(values.get("body_turn_rad", 0.0))]))
-    new = old @ make_pose(turn, pivot_m)
+    turn = rotation(np.array([0.0, 0.0, number_in(record, "body_turn_rad")]))
+    new = old @ make_pose(turn, _vector(record, "pivot_{}_m"))
     pivot = tuple(round(one, 6) for one in new[:3, 3].tolist())
     rpy_rad = tuple(round(one, 6) for one in rpy_from_rotation(new[:3, :3]))
     bodies[robot] = replace(own, pivot_m=pivot, pivot_rpy_rad=rpy_rad)

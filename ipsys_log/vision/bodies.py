@@ -37,7 +37,8 @@ class BodyShape:
     is_level : it stays level.
     is_measured : the poses of its markers are known. Otherwise it has one marker of the nominal size.
     scale_sigma : relative standard deviation of its size.
-    corners_m : by marker id, the corners (4, 3) in the coordinates of the body, in the order of OpenCV.
+    markers : by marker id, the poses (4, 4) of the markers in the coordinates of the body.
+    corners_m : by marker id, their corners (4, 3) in these coordinates, in the order of OpenCV.
     body_from_pivot : (4, 4).
     """
 
@@ -46,6 +47,7 @@ class BodyShape:
     is_level: bool
     is_measured: bool
     scale_sigma: float
+    markers: dict[int, Array]
     corners_m: dict[int, Array]
     body_from_pivot: Array
 
@@ -54,18 +56,22 @@ def body_shapes(rig: Rig) -> tuple[BodyShape, ...]:
     """Return the bodies of a rig, in its order."""
     shapes = []
     for body in rig.bodies:
-        markers = [marker for marker in rig.markers if marker.robot == body.robot]
-        corners_m = {
-            marker.id: transform(
-                pose_from_rpy(marker.xyz_m, marker.rpy_rad), marker_corners_m(rig.length_of(marker.id))
-            )
-            for number, marker in enumerate(markers)
+        own = [marker for marker in rig.markers if marker.robot == body.robot]
+        markers = {
+            marker.id: pose_from_rpy(marker.xyz_m, marker.rpy_rad)
+            for number, marker in enumerate(own)
             if not number or marker.xyz_m
         }
+        corners_m = {
+            marker_id: transform(pose, marker_corners_m(rig.length_of(marker_id)))
+            for marker_id, pose in markers.items()
+        }
         pivot = pose_from_rpy(body.pivot_m, body.pivot_rpy_rad)
-        measured = any(marker.xyz_m for marker in markers)
+        measured = any(marker.xyz_m for marker in own)
         sigma = _SCALE_SIGMA if body.scale_sigma is None else body.scale_sigma
-        shapes.append(BodyShape(body.robot, markers[0].id, body.level, measured, sigma, corners_m, pivot))
+        shapes.append(
+            BodyShape(body.robot, own[0].id, body.level, measured, sigma, markers, corners_m, pivot)
+        )
     return tuple(shapes)
 
 

@@ -145,6 +145,12 @@ def turn_about_z(angle_rad: float) -> Array:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
+def turns_about_z(angles_rad: Array) -> Array:
+    """Return rotations (n, 3, 3) about the z axis by angles (n,); NaN for an angle that is NaN."""
+    c, s, none = np.cos(angles_rad), np.sin(angles_rad), 0.0 * angles_rad
+    return np.moveaxis(np.array([[c, -s, none], [s, c, none], [none, none, none + 1.0]]), 2, 0)
+
+
 def level_turns(headings_rad: Array) -> Array:
     """Return ``world_from_marker`` rotations (n, 3, 3) of markers that face up, with headings (n,).
 

@@ -405,3 +405,33 @@ def test_pivot_of_level_and_of_free_body_is_tracked() -> None:
     expected = by_pose @ noise @ by_pose.T + 1e-8 * np.eye(6)
     np.testing.assert_allclose(eve.pose_covariance, expected, rtol=0.02, atol=1e-9)
     assert made[1].transforms[1].rotation.w == pytest.approx(abs(turned.as_quat()[3]))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"rotation_rad": np.array([np.nan, 0.0, 0.0])},
+        {"still_noise": np.full((6, 6), np.nan)},
+        {"still_noise": -np.eye(6)},
+        {"error_modes": np.ones(5)},
+        {"error_modes": np.full(14, np.inf)},
+        {"to_still": np.full(6, np.nan)},
+        {"still_by_motion": np.full((6, 6), 1e300)},
+    ],
+    ids=lambda wrong: next(iter(wrong)),
+)
+def test_free_body_of_a_hostile_log_gives_finite_tracks(wrong: dict[str, Any]) -> None:
+    rig = Rig("lab", "DICT_4X4_100", 0.2, (RigMarker(1, robot="eve"),), bodies=(RigBody("eve", False),))
+    own = Position(1, 1.0, 2.0, 0.4, rotation_rad=np.zeros(3), still_noise=1e-6 * np.eye(6))
+    fuse = Fuse("joint")
+    list(fuse(Message("/rig", 0, 0, rig)))
+    made: list[Any] = []
+    for number, position in enumerate((own, replace(own, **wrong), own)):
+        time_ns = number * 33_000_000
+        made += fuse(Message("t", time_ns, time_ns, Positions(time_ns, (position,)), "red"))
+    tracks = [track for one in made if isinstance(one, Tracks) for track in one.tracks]
+    assert len(tracks) == 3 - ("rotation_rad" in wrong)
+    for track in tracks:
+        assert np.isfinite([track.x_m, track.y_m, track.z_m]).all()
+        assert np.isfinite(np.array(track.rotation_rad, dtype=np.float64)).all()
+        assert track.pose_covariance is None or np.linalg.eigvalsh(track.pose_covariance)[0] > 0

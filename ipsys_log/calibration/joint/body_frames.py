@@ -13,6 +13,7 @@ from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Marker, Markers, Message
 from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.lenses import undistort
+from ipsys_log.vision.square_pose import is_convex
 
 # More frames take longer than seconds, and the noise is no longer the largest error.
 _MOST_FRAMES = 300
@@ -48,7 +49,7 @@ def read_frames(
             continue
         frame = BodyFrame(str(message.camera), [], [])
         for marker in message.payload.markers:
-            if marker.id in ids and np.isfinite(undistort(marker.corners_px, model.calibration)).all():
+            if marker.id in ids and is_convex(undistort(marker.corners_px, model.calibration)):
                 later_s = float(marker.corners_px[:, 1].mean()) * model.row_time_s + model.clock_s
                 later_ns = (marker.time_offset_ns or 0) + round(later_s * NS_PER_S)
                 frame.markers.append(marker)

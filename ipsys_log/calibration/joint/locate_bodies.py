@@ -66,8 +66,8 @@ class BodyPoses:
         and about the axes of the world.
     modes : (b, 6, m), errors of these poses by the modes of the calibration.
     by_scale : (b, 6), errors of these poses by the relative error of the size of the body.
-    chi2 : (b,), squared residuals in units of the noise and of a usual velocity, with 8 k - 6 degrees of
-        freedom.
+    chi2, still_chi2 : (b,), squared residuals of both poses, with 8 k - 6 degrees of freedom: in units of the
+        noise and of a usual velocity, and of the noise alone.
     """
 
     points_m: Array
@@ -79,6 +79,7 @@ class BodyPoses:
     modes: Array
     by_scale: Array
     chi2: Array
+    still_chi2: Array
 
 
 def locate_bodies(model: JointModel, seen: BodySightings) -> BodyPoses:
@@ -196,6 +197,8 @@ class _Rounds:
         turned, standing = (rotate(-change[:, 3:]) @ turns for change in (moving, still))
         to_still = rotation_vectors(standing @ turned.swapaxes(1, 2))
         by_camera = -(gains @ now.by_camera)
+        left = now.residuals - (now.by_pose @ still[:, :, None])[:, :, 0]
+        weighed = np.linalg.solve(variances, left[:, :, None])[:, :, 0]
         return BodyPoses(
             points_m - moving[:, :3],
             turned,
@@ -206,6 +209,7 @@ class _Rounds:
             by_camera @ self._model.modes,
             by_camera[:, :, -1] * self._model.scale,
             now.chi2,
+            (left * weighed).sum(axis=1),
         )
 
 

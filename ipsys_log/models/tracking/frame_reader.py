@@ -12,7 +12,7 @@ from ipsys_log.models.tracking.bias_modes import BiasModes
 from ipsys_log.models.tracking.filter import UNKNOWN_RAD2, Sightings
 from ipsys_log.models.tracking.tracks import Robot
 from ipsys_log.vision.bodies import BodyShape, body_shapes, rpy_from_rotation
-from ipsys_log.vision.poses import invert_pose, make_pose, rotation, skew_matrices
+from ipsys_log.vision.poses import invert_pose, rotation, skew_matrices
 
 # An offset is used after this number of frames
 _FEWEST_FRAMES = 10
@@ -97,7 +97,7 @@ class FrameReader:
         if free:
             robots = [self._robots.get(p.id) or self._robot_of(p.id) for p in free]
             pivots = [self._shapes[p.id].body_from_pivot if p.id in self._shapes else np.eye(4) for p in free]
-            known = [position.still_noise is not None for position in free]
+            known = [_pose_noise(position) is not None for position in free]
             yield _frame(camera, time_ns, free, robots, _read_free(free, pivots), known)
 
     def _robot_of(self, marker_id: int) -> Robot:
@@ -121,6 +121,22 @@ def _frame(
     return FrameSightings(camera, robots, times_ns, sightings, inside, has_covariance)
 
 
+def _numbers(values: Array | None, shape: tuple[int, ...]) -> Array:
+    """Return an array of a shape, 0 for a missing one and for other numbers in a log of another program."""
+    size = abs(int(np.prod(shape)))
+    if values is None or values.size % size or not (np.abs(values) < _FARTHEST_M).all():
+        return np.zeros([max(length, 0) for length in shape])
+    return values.reshape(shape)
+
+
+def _pose_noise(position: Position) -> Array | None:
+    """Return the covariance of the pose of a free body; None if it is unknown or not positive definite."""
+    noise = position.still_noise
+    if noise is None or not (np.abs(noise) < _FARTHEST_M).all():
+        return None
+    return noise if np.linalg.eigvalsh(noise)[0] > 0 else None
+
+
 def _read_free(positions: Sequence[Position], pivots: Sequence[Array]) -> Sightings:
     """Return the sightings of the pivots (4, 4) of free bodies from the positions of the bodies."""
     count = len(positions)
@@ -129,7 +145,7 @@ def _read_free(positions: Sequence[Position], pivots: Sequence[Array]) -> Sighti
     by_motion = np.zeros((count, 6, 6))
     for row, (position, pivot) in enumerate(zip(positions, pivots, strict=True)):
         assert position.rotation_rad is not None
-        to_still = np.zeros(6) if position.to_still is None else position.to_still
+        to_still = _numbers(position.to_still, (6,))
         turn = rotation(to_still[3:]) @ rotation(position.rotation_rad)
         arm_m = turn @ pivot[:3, 3]
         poses[row, :3] = np.array([position.x_m, position.y_m, position.z_m]) + to_still[:3] + arm_m
@@ -137,14 +153,13 @@ def _read_free(positions: Sequence[Position], pivots: Sequence[Array]) -> Sighti
         # A turn of the body moves the pivot around its origin.
         by_pose = np.eye(6)
         by_pose[:3, 3:] = -skew_matrices(arm_m[None])[0]
-        own = _UNKNOWN_POSE if position.still_noise is None else position.still_noise
-        noise[row] = by_pose @ own @ by_pose.T + _LEAST_POSE
-        own = np.zeros((7, 0)) if position.error_modes is None else position.error_modes.reshape(7, -1)
+        known = _pose_noise(position)
+        noise[row] = by_pose @ (_UNKNOWN_POSE if known is None else known) @ by_pose.T + _LEAST_POSE
+        own = _numbers(position.error_modes, (7, -1))
         modes[row, :, : own.shape[1]] = own[:, :FREE_MODES]
         modes[row, :6] = by_pose @ modes[row, :6]
-        if position.still_by_motion is not None:
-            # The rates are those of the pivot: the body moves around it.
-            by_motion[row] = by_pose @ position.still_by_motion @ np.linalg.inv(by_pose)
+        # The rates are those of the pivot: the body moves around it.
+        by_motion[row] = by_pose @ _numbers(position.still_by_motion, (6, 6)) @ np.linalg.inv(by_pose)
     return Sightings(poses, noise, modes[:, :6], modes[:, 6], turns, by_motion)
 
 
@@ -183,9 +198,8 @@ class _Offsets:
 
     def __post_init__(self) -> None:
         for marker_id, shape in self.shapes.items():
-            if marker_id in shape.corners_m:
-                body_from_marker = _marker_pose(shape.corners_m[marker_id])
-                marker_from_pivot = invert_pose(body_from_marker) @ shape.body_from_pivot
+            if marker_id in shape.markers:
+                marker_from_pivot = invert_pose(shape.markers[marker_id]) @ shape.body_from_pivot
                 yaw_rad = rpy_from_rotation(marker_from_pivot[:3, :3])[2]
                 self.known[marker_id] = np.array([*marker_from_pivot[:3, 3], yaw_rad])
 
@@ -199,7 +213,7 @@ class _Offsets:
         for marker_id, row in rows.items():
             shape = self.shapes.get(marker_id)
             reference = None if shape is None else rows.get(shape.id)
-            if reference is None or shape is None or marker_id in shape.corners_m:
+            if reference is None or shape is None or marker_id in shape.markers:
                 continue
             pivot = _add_offset(poses[reference], self.known[shape.id])
             offset = pivot - poses[row]
@@ -239,13 +253,6 @@ class _Offsets:
         return Sightings(poses, noise, sensitivities, sightings.clock_s)
 
 
-def _marker_pose(corners_m: Array) -> Array:
-    """Return the pose (4, 4) of a marker on its body from its corners (4, 3)."""
-    up, left = corners_m[0] - corners_m[3], corners_m[0] - corners_m[1]
-    axes = np.stack([up, left, np.cross(up, left) / np.linalg.norm(up)], axis=1) / np.linalg.norm(up)
-    return make_pose(axes, corners_m.mean(axis=0))
-
-
 def _add_offset(pose: Array, offset: Array) -> Array:
     """Return a pose (4,) moved by an offset (4,) in its own axes."""
     return np.concatenate([pose[:2] + _turn(pose[3]) @ offset[:2], pose[2:] + offset[2:]])
@@ -257,11 +264,13 @@ def _turn(angle_rad: float) -> Array:
 
 
 def _is_usable(position: Position) -> bool:
-    """Return whether a position is a place; the log of another program may hold other numbers."""
+    """Return whether a position is a place, and its rotation a turn; a log may hold other numbers."""
+    turn_rad = position.rotation_rad
     return (
         -_FARTHEST_M < position.x_m < _FARTHEST_M
         and -_FARTHEST_M < position.y_m < _FARTHEST_M
         and -_FARTHEST_M < position.z_m < _FARTHEST_M
+        and (turn_rad is None or bool((np.abs(turn_rad) < _LARGEST_RAD).all()))
     )
 
 

@@ -139,7 +139,7 @@ def _rpy_covariance(
     ``known`` (6, 6) is that of x, y, z and of a turn about the axes of the world.
     """
     _, pitch_rad, yaw_rad = rpy_rad
-    # The axes of roll, pitch and yaw. Those of roll and yaw are the same if the robot stands on its nose.
+    # The axes of roll, pitch and yaw. Those of roll and yaw are the same at a pitch of 90 degrees.
     steep = max(cos(pitch_rad), _LEAST_COSINE)
     axes = turn_about_z(yaw_rad) @ np.array([[steep, 0, 0], [0, 1, 0], [-sin(pitch_rad), 0, 1]])
     local = np.zeros((6, 6))

@@ -143,7 +143,7 @@ def test_simulate_interrupted_leaves_no_partial_file(number: int, tmp_path: Path
     size = ("--width", "320", "--height", "180", "--drive-s", "300")
     command = ("simulate", "-o", tmp_path / "lab.mcap", *size)
     with start(*command) as program:
-        wait_for(tmp_path / "lab.mcap.partial", 1)
+        wait_for(tmp_path / "lab.mcap.partial", 10_000)  # the command has opened the log
         program.send_signal(number)
         _, err = program.communicate(timeout=LIMIT_S)
     assert program.returncode == 128 + number, err

@@ -34,7 +34,7 @@ def residuals_of(problem: Problem, state: State, ease: float = 1.0) -> Array:
         _robust(points.heights[:, None], one),
         _robust(points.places, two),
         points.tilts.ravel(),
-        trajectories.acceleration_residuals(state),
+        trajectories.smoothness_residuals(state),
     ]
     prior = problem.prior_residuals(state)
     bodies = slice(layout.scales.start, layout.heights.stop)

@@ -15,7 +15,11 @@ from ipsys_log.calibration.joint.point_factors import make_point_factors
 from ipsys_log.calibration.joint.prior_sigmas import most_likely_scale, widen_tape
 from ipsys_log.calibration.joint.problem import Problem, find_blocks
 from ipsys_log.calibration.joint.settings import JointSettings
-from ipsys_log.calibration.joint.sighting_factors import SightingFactors, make_sighting_factors
+from ipsys_log.calibration.joint.sighting_factors import (
+    SightingFactors,
+    at_one_instant,
+    make_sighting_factors,
+)
 from ipsys_log.calibration.joint.solver import SHORT, ConvergenceError, Solution, solve
 from ipsys_log.calibration.joint.start import PlacedCamera, UnplacedError, place_cameras, rough_points
 from ipsys_log.calibration.joint.trajectories import Kind, Trajectories
@@ -333,11 +337,7 @@ def _make_factors(
             continue
         own = sightings.select(rows), trajectory[rows], kind
         made = make_sighting_factors(camera, *own, observations.bodies, floor_px)
-        if observations.cameras[camera].known_row_s:
-            # With a row time, whether right or wrong, detection gives the corners of one instant.
-            rows_px = made.rows.mean(axis=1, keepdims=True)
-            made = replace(made, rows=np.broadcast_to(rows_px, made.rows.shape))
-        factors.append(made)
+        factors.append(at_one_instant(made) if observations.cameras[camera].known_row_s else made)
     return factors
 
 

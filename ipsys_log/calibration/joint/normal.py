@@ -201,6 +201,11 @@ class Factorisation:
         right = -(pulled[:, 0] + self._push(by_global[self.free]))
         return by_global, self._backward(right[:, None])[:, 0]
 
+    def log_determinant(self) -> float:
+        """Return the logarithm of the determinant of the equations of all free unknowns."""
+        parts = np.log(self.band[0]), np.log(self.reduced[0].diagonal()), -np.log(self.units)
+        return 2 * float(sum(part.sum() for part in parts))
+
     def global_covariance(self) -> Array:
         """Return the covariance (g, g) of the global unknowns; zero for constant ones."""
         inverse = cho_solve(self.reduced, np.eye(len(self.units)), check_finite=False)

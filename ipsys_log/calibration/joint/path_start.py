@@ -27,7 +27,7 @@ _FRAMES_PER_KNOT = 1.0
 _SHORTEST_STEP_S = 0.09
 _LONGEST_STEP_S = 0.25
 # The path continues this long before and after its sightings, because clocks have offsets.
-_PAD_S = 0.25
+PAD_S = 0.25
 # Errors of a place and of a heading from one marker and rough camera poses.
 _PLACE_M = 0.01
 _HEADING_RAD = 0.02
@@ -68,8 +68,8 @@ def start_paths(
         longest_s = _LONGEST_PART_S if observations.in_hall else np.inf
         for part in _parts(_places(observations, placed, body), longest_s):
             step_s = _step(part)
-            start_s = float(part.times_s[0]) - _PAD_S
-            count = int(np.ceil((part.times_s[-1] + _PAD_S - start_s) / step_s)) + 3
+            start_s = float(part.times_s[0]) - PAD_S
+            count = int(np.ceil((part.times_s[-1] + PAD_S - start_s) / step_s)) + 3
             for camera, rows in enumerate(numbers):
                 rows[part.rows[part.cameras == camera]] = len(columns)
             columns.append((start_s, step_s, first, count, body))
@@ -161,8 +161,8 @@ def _fit_knots(paths: Paths, parts: list[_Places], settings: JointSettings) -> A
 
 def cover_times(times_s: Array, step_s: float) -> Paths:
     """Return one path that covers times (n,), with knots ``step_s`` apart."""
-    start_s = float(times_s.min()) - _PAD_S
-    count = int(np.ceil((float(times_s.max()) + _PAD_S - start_s) / step_s)) + 3
+    start_s = float(times_s.min()) - PAD_S
+    count = int(np.ceil((float(times_s.max()) + PAD_S - start_s) / step_s)) + 3
     first = np.zeros(1, dtype=np.intp)
     return Paths(np.array([start_s]), np.array([step_s]), first, np.array([count]), first)
 
@@ -197,7 +197,7 @@ def smooth_knots(
         residuals = (values - places) / sigmas
         normal.add_local(size * near, slopes * roots[:, None, None], residuals * roots[:, None])
         moved = replace(empty, knots=knots) if size == 3 else replace(empty, free_knots=knots)
-        trajectories.add_accelerations(normal, moved)
+        trajectories.add_smoothness(normal, moved)
         step = solveh_banded(normal.band, -normal.local_gradient, lower=True, check_finite=False)
         knots = knots + step.reshape(-1, size)
         values = (weights[:, :, None] * knots[near[:, None] + np.arange(4)]).sum(axis=1)

@@ -36,7 +36,7 @@ class Problem:
         for factors in self.sightings:
             chi2 = factors.chi2(state, self.layout, self.trajectories)
             total += float(robust_loss(chi2, factors.limit * ease)[0].sum()) / 2
-        total += float((self.trajectories.acceleration_residuals(state) ** 2).sum()) / 2
+        total += float((self.trajectories.smoothness_residuals(state) ** 2).sum()) / 2
         return total + float(self._prior_loss(state)[1].sum()) / 2
 
     def permits(self, state: State) -> bool:
@@ -57,7 +57,7 @@ class Problem:
         for factors in self.sightings:
             factors.add_to(normal, state, layout, trajectories, ease)
         self.points.add_to(normal, state, layout, ease)
-        trajectories.add_accelerations(normal, state)
+        trajectories.add_smoothness(normal, state)
         residuals, loss, weights = self._prior_loss(state)
         normal.cost += float(loss.sum()) / 2
         sigma = layout.sigma

@@ -32,6 +32,9 @@ class JointSettings:
     robot_height_sigma_m : error of the height at which a robot carries its marker, where the rig has none.
     acceleration_sigma, turn_sigma : usual acceleration of a robot, in m/s^2 and rad/s^2. They bridge gaps of
         the path without sightings.
+    jerk_density, turn_jerk_density : roots of the power densities of the jerk of a body in a hand, in m/s^2.5
+        and rad/s^2.5.
+    stamp_jitter_s : random errors of the times of frames, in sightings of such a body.
     follows_valleys : whether a fit that does not converge in the usual steps goes on with long ones.
     """
 
@@ -55,4 +58,7 @@ class JointSettings:
     robot_height_sigma_m: float = 0.001
     acceleration_sigma: float = 3.0
     turn_sigma: float = 10.0
+    jerk_density: float = 3.0
+    turn_jerk_density: float = 10.0
+    stamp_jitter_s: float = 0.001
     follows_valleys: bool = True

@@ -209,6 +209,25 @@ class SightingFactors:
         tilts = tilt_sigma_rad * np.sqrt(self._sharing(tilt_time_s)) * by_pose[:, :, 3:5]
         return replace(self, whitening=_whitening(self.variances + tilts @ tilts.swapaxes(1, 2)))
 
+    def jittered(
+        self, state: State, layout: Layout, trajectories: Trajectories, jitter_s: float
+    ) -> SightingFactors:
+        """Return these factors with random errors of the frames' times as noise of their points."""
+        place = self.place(state, layout, trajectories)
+        clock = layout.cameras[self.camera].edge + 1 - layout.cameras[self.camera].start
+        by_time = self.slopes(place, state, layout).by_global[:, :, clock : clock + 1] * self._visible
+        noise = jitter_s**2 * by_time @ by_time.swapaxes(1, 2)
+        return replace(self, whitening=_whitening(self.variances + noise) * self._visible)
+
+    @property
+    def _visible(self) -> Array:
+        """1 for each coordinate of a visible point, 0 for others, (n, 2 p, 1)."""
+        return np.repeat(np.isfinite(self.sightings.pixels[:, :, :1]), 2, axis=1).astype(np.float64)
+
+    def log_weights(self) -> float:
+        """Return the logarithm of the product of all weights of the residuals."""
+        return float(np.log(np.diagonal(self.whitening, axis1=1, axis2=2)[self._visible[:, :, 0] > 0]).sum())
+
     def _sharing(self, tilt_time_s: float) -> float:
         """Return how many sightings of a path share one tilt: at least 1."""
         order = np.lexsort((self.sightings.times_s, self.trajectory))
@@ -266,6 +285,15 @@ def make_sighting_factors(
         variances,
         whitening,
     )
+
+
+def at_one_instant(factors: SightingFactors) -> SightingFactors:
+    """Return factors of points that are those of one instant.
+
+    With a row time, whether right or wrong, detection gives such points.
+    """
+    rows_px = factors.rows.mean(axis=1, keepdims=True)
+    return replace(factors, rows=np.broadcast_to(rows_px, factors.rows.shape))
 
 
 def _fill(covariances: Array) -> Array:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from enum import Enum
+from math import comb
+from typing import NamedTuple
 
 import numpy as np
 
@@ -92,6 +95,8 @@ class Trajectories:
     acceleration_sigma, turn_sigma : usual accelerations on a path, in m/s^2 and rad/s^2.
     free_paths : free paths, with six unknowns at each knot.
     free_turns : (i, 3, 3), mean orientation of the body on each free path.
+    jerk_density, turn_jerk_density : roots of the power densities of the jerk on a free path, in m/s^2.5 and
+        rad/s^2.5.
     """
 
     stationary: int
@@ -100,6 +105,8 @@ class Trajectories:
     turn_sigma: float = np.inf
     free_paths: Paths = _NO_PATHS
     free_turns: Array = field(default_factory=lambda: np.zeros((0, 3, 3)))
+    jerk_density: float = np.inf
+    turn_jerk_density: float = np.inf
 
     @property
     def local_count(self) -> int:
@@ -168,39 +175,56 @@ class Trajectories:
             velocities,
         )
 
-    def add_accelerations(self, normal: NormalEquations, state: State) -> None:
-        """Add the prior on accelerations of the paths."""
-        starts = _POSE * self.stationary, self._free_start
-        parts = zip((self.paths, self.free_paths), (state.knots, state.free_knots), starts, strict=True)
-        for paths, knots, start in parts:
-            middles, scales = self._accelerations(paths, knots.shape[1])
-            size = knots.shape[1]
-            slopes = scales[:, :, None, None] * np.array([[1.0], [-2.0], [1.0]]) * np.eye(size)[:, None]
-            residuals = _second_differences(knots, middles) * scales
+    def add_smoothness(self, normal: NormalEquations, state: State) -> None:
+        """Add the prior on accelerations of paths over the floor, and on the jerk of free paths."""
+        for start, first, factors in self._smoothness(state):
+            residuals = factors.residuals
             normal.cost += float((residuals**2).sum()) / 2
-            if len(middles):
-                slopes = slopes.reshape(len(middles), size, -1)
-                normal.add_local(start + size * (middles - 1), slopes, residuals)
+            if len(first):
+                size = residuals.shape[1]
+                units = factors.weights[:, None] * np.eye(size)[:, None]
+                slopes = factors.scales[:, :, None, None] * units
+                normal.add_local(start + size * first, slopes.reshape(len(first), size, -1), residuals)
 
-    def acceleration_residuals(self, state: State) -> Array:
-        """Return second differences of the knots, in units of the usual acceleration."""
-        parts = []
-        for paths, knots in ((self.paths, state.knots), (self.free_paths, state.free_knots)):
-            middles, scales = self._accelerations(paths, knots.shape[1])
-            parts.append((_second_differences(knots, middles) * scales).ravel())
-        return np.concatenate(parts)
+    def smoothness_residuals(self, state: State) -> Array:
+        """Return differences of the knots, in units of the usual acceleration or jerk."""
+        return np.concatenate([factors.residuals.ravel() for _, _, factors in self._smoothness(state)])
 
-    def _accelerations(self, paths: Paths, size: int) -> tuple[Indices, Array]:
-        """Return the inner knots (n,), and factors (n, size) of their second differences."""
-        numbers = np.repeat(np.arange(len(paths)), paths.counts - 2)
-        inner = np.concatenate(
-            [np.arange(f + 1, f + c - 1) for f, c in zip(paths.first, paths.counts, strict=True)]
-            or [np.zeros(0, dtype=np.intp)]
-        )
-        turns = 1 if size == _KNOT else 3
-        sigmas = np.r_[np.full(size - turns, self.acceleration_sigma), np.full(turns, self.turn_sigma)]
-        return inner, 1 / (paths.steps_s[numbers, None] ** 2 * sigmas)
+    def _smoothness(self, state: State) -> Iterator[tuple[int, Indices, _Differences]]:
+        """Yield the first local unknown, the first knot of each factor, and the factors, for both kinds."""
+        sigmas = np.array([self.acceleration_sigma, self.acceleration_sigma, self.turn_sigma])
+        yield _POSE * self.stationary, *_differences(self.paths, state.knots, 2, 2.0, sigmas)
+        densities = np.repeat([self.jerk_density, self.turn_jerk_density], 3)
+        yield self._free_start, *_differences(self.free_paths, state.free_knots, 3, 2.5, densities)
 
 
-def _second_differences(knots: Array, middles: Indices) -> Array:
-    return np.asarray(knots[middles - 1] - 2 * knots[middles] + knots[middles + 1])
+class _Differences(NamedTuple):
+    """Differences of n times order + 1 consecutive knots of d unknowns, by their standard deviations.
+
+    ``weights`` (order + 1,) are those of the knots, ``scales`` and ``residuals`` are (n, d).
+    """
+
+    weights: Array
+    scales: Array
+    residuals: Array
+
+
+def _differences(
+    paths: Paths, knots: Array, order: int, power: float, sigmas: Array
+) -> tuple[Indices, _Differences]:
+    """Return the first knot of each difference of an order, and the differences.
+
+    The standard deviation of a difference is ``sigmas`` (d,) times the interval to a ``power``. White jerk of
+    the density s has third differences of the standard deviation s h^2.5 at knots h apart.
+    """
+    numbers = np.repeat(np.arange(len(paths)), paths.counts - order)
+    first = np.concatenate(
+        [np.arange(f, f + c - order) for f, c in zip(paths.first, paths.counts, strict=True)]
+        or [np.zeros(0, dtype=np.intp)]
+    )
+    weights = np.array([(-1.0) ** (order - k) * comb(order, k) for k in range(order + 1)])
+    scales = 1 / (paths.steps_s[numbers, None] ** power * sigmas)
+    differences = np.zeros((len(first), knots.shape[1]))
+    for k, weight in enumerate(weights.tolist()):
+        differences += weight * knots[first + k]
+    return first, _Differences(weights, scales, differences * scales)

@@ -52,12 +52,21 @@ Terminal = Annotated[
         "Without LOG: ask for the measured points in the terminal after the drive, not on a page.",
     ),
 ]
+CarriedBody = Annotated[
+    str | None,
+    setting(
+        "--body",
+        "ROBOT",
+        "Use this body of the rig, which is carried by hand. Cameras may hang on walls.",
+    ),
+]
 _LEAST_POINTS = 2
 
 
 def calibrate_lab(
     logs: Sources = None,
     goal_mm: Goal = 3.0,
+    body: CarriedBody = None,
     focal: lab_inputs.Focal = None,
     field_of_view: lab_inputs.FieldOfView = None,
     train: cli.Train = "train",
@@ -80,6 +89,10 @@ def calibrate_lab(
     If it is not, the command names points to measure and a part of the floor to drive through. Without a
     tape: lay a marker on each of two reference points, and enter 0 as its distance.
 
+    With --body, the command needs no level floor in view: carry the body through the fields of view, each
+    shared by two cameras, then lay it down for 3 s where the origin of the lab is to be. Measured points, if
+    there are two, define the coordinates instead. The command estimates poses, intrinsics and clocks.
+
     Without LOG, the command records the cameras of --rig into -o until Ctrl-C. Meanwhile it prints the
     expected error, and takes the measured points on a page.
 
@@ -88,6 +101,7 @@ def calibrate_lab(
         ipsys calibrate-lab drive.mcap cal.mcap --plot floor.png
         ipsys calibrate-lab lab.mcap --goal-mm 2           # is 2 mm reached?
         ipsys calibrate-lab lab.mcap --field-of-view 105   # without a chessboard
+        ipsys calibrate-lab carry.mcap --body wand         # cameras on walls
     """
     from ipsys_log.engine.graph import writes
     from ipsys_log.engine.request import Request
@@ -118,6 +132,11 @@ def calibrate_lab(
     lenses = {**lenses, **nominal_values}
     given: dict[str, Any] = {"model": ["joint"], "lenses": lenses, "train": train}
     given |= {"rig": rig, "calibration": None, "corners": corners, "run": None}
+    if body is not None:
+        if plot is not None:
+            raise IpsysError("--plot draws the floor of drives; leave it out with --body")
+        _calibrate_carried(logs, body, given_rig, given, output, as_json)
+        return
     with derive(logs, "fit", output, **given) as (session, outcomes, _):
         run = next(outcome.run for outcome in reversed(outcomes) if writes(outcome, MODEL))
         in_force, all_lenses = lab_inputs.lab_of_run(session, run, given_rig, lenses)
@@ -129,6 +148,41 @@ def calibrate_lab(
                 lambda done, total: progress("describe", done, total),
             )  # fmt: skip
         _show(lab, plot, as_json)
+
+
+def _calibrate_carried(
+    logs: Sequence[LogLocation],
+    body: str,
+    rig: Rig | None,
+    given: dict[str, Any],
+    output: Path | None,
+    as_json: bool,
+) -> None:
+    """Calibrate the cameras from a carried body, after its detection, and append the model."""
+    from ipsys_log.app.report.calibration import carried_json, carried_lines, carried_table
+    from ipsys_log.engine.output import append_run, choose_target, open_target
+    from ipsys_log.engine.provenance import newest_run
+    from ipsys_log.log.dataset import Session
+    from ipsys_log.messages.channels import MARKERS
+    from ipsys_log.tools.carried_lab import calibrate_carried_lab
+
+    with Session(logs) as session:
+        has_images = bool(session.images)
+    if has_images:  # else another program has detected the markers
+        with derive(logs, "detect", output, **given):
+            pass
+    sources, target = choose_target(logs, output)
+    if target is not None and target.exists():
+        sources, target = [*sources, target], None
+    with Session(sources) as session, progress_bar() as progress:
+        run = newest_run(session, MARKERS) or ""
+        in_force, lenses = lab_inputs.lab_of_run(session, run, rig, given["lenses"])
+        lab, record, message = calibrate_carried_lab(session, body, in_force, lenses, progress)
+    with open_target(sources, target) as (_, log):
+        append_run(log, record, message.log_time_ns, lambda: [message], {})
+    print_result({"run": record.run, **carried_json(lab)}, [carried_table(lab), *carried_lines(lab)], as_json)
+    say(f"run {record.run} written to {target or log}")
+    say(f"next: ipsys replay OTHER.mcap --model-from {target or log} --model joint")
 
 
 def _check(logs: Sequence[LogLocation], rig: Rig | None) -> None:

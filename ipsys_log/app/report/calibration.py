@@ -8,15 +8,18 @@ from collections import Counter
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from ipsys_log.app.report.json_format import plain
-from ipsys_log.app.report.rows import Rows, cm, counted, means_cm, mm
-from ipsys_log.units import CM_PER_M, MM_PER_M
+from ipsys_log.app.report.rows import Rows, cm, counted, means_cm, mm, wrap_text
+from ipsys_log.units import CM_PER_M, MM_PER_M, NS_PER_S
 
 if TYPE_CHECKING:
     from ipsys_log.calibration.board_search import ExcludedSighting
     from ipsys_log.calibration.calibrate import CalibrationResult
     from ipsys_log.live_runs.survey.floor_plan import PlannedFloor
     from ipsys_log.live_runs.survey.lab_calibration import CameraResult, LabCalibration
+    from ipsys_log.tools.carried_lab import CarriedLab
 
 _SHOWN_DROPPED = 6
 
@@ -228,6 +231,86 @@ def _camera_json(camera: CameraResult) -> dict[str, Any]:
 
 def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
+
+
+def carried_table(lab: CarriedLab) -> Rows:
+    """Return a table of the cameras that a carried body has calibrated."""
+    cells = []
+    for camera in _carried_cameras(lab):
+        numbers = [*camera["origin_m"], 1000 * max(camera["origin_sigmas_m"])]
+        clock = "reference" if not camera["clock_sigma_s"] else f"{1000 * camera['clock_s']:.2f}"
+        cells.append(
+            [
+                camera["camera"],
+                *(f"{number:.3f}" for number in numbers[:3]),
+                f"{numbers[3]:.1f}",
+                f"{camera['focal_px'][0]:.1f}",
+                clock,
+                f"{1000 * camera['clock_sigma_s']:.2f}",
+                f"{camera['held_out_rmse_px']:.2f}",
+            ]
+        )
+    heads = ("camera", ">x m", ">y m", ">z m", ">± mm", ">focal px", ">clock ms", ">±", ">held out px")
+    note = "Held out: RMSE of the corners in frames that were not in the fit"
+    return Rows(f"Cameras by {lab.robot}", heads, cells, note)
+
+
+def carried_lines(lab: CarriedLab) -> Iterator[str]:
+    """Yield lines on the coordinates of the lab, and on what contradicts them."""
+    if lab.rest is not None:
+        seconds = (lab.rest.end - lab.rest.start) / NS_PER_S
+        yield wrap_text(
+            f"Coordinates: those of {lab.robot} at rest, for {seconds:.1f} s. They are level to about 1 mm "
+            "for each metre; measured points are better for robots on the floor."
+        )
+    else:
+        yield "Coordinates: those of the measured points."
+    settings = lab.fit.settings
+    yield wrap_text(
+        f"Motion: jerk {settings.jerk_density:.1g} m/s^2.5; jitter of the stamps "
+        f"{1000 * settings.stamp_jitter_s:.2g} ms."
+    )
+    for remark in lab.remarks:
+        yield wrap_text(f"Warning: {remark}.")
+
+
+def carried_json(lab: CarriedLab) -> dict[str, Any]:
+    """Return the same as JSON, in SI units."""
+    return {
+        "body": lab.robot,
+        "rest": None if lab.rest is None else plain(lab.rest),
+        "stamp_jitter_s": lab.fit.settings.stamp_jitter_s,
+        "jerk_density": lab.fit.settings.jerk_density,
+        "cameras": _carried_cameras(lab),
+        "remarks": list(lab.remarks),
+    }
+
+
+def _carried_cameras(lab: CarriedLab) -> list[dict[str, Any]]:
+    fit, rows = lab.fit, []
+    sigmas = np.sqrt(fit.covariance.diagonal())
+    for number, (name, errors_px) in enumerate(lab.held_out_px.items()):
+        block, values = fit.problem.layout.cameras[number], fit.state.values
+        origin = slice(block.start + 3, block.start + 6)
+        lengths_px = np.linalg.norm(errors_px, axis=2)
+        rows.append(
+            {
+                "camera": name,
+                "sightings": len(fit.observations.sightings[number]),
+                "origin_m": values[origin].tolist(),
+                "origin_sigmas_m": sigmas[origin].tolist(),
+                "camera_from_world": fit.state.camera_turns[number].tolist(),
+                "focal_px": values[block.lens][:2].tolist(),
+                "principal_point_px": values[block.lens][2:4].tolist(),
+                "distortion": values[block.lens][4:].tolist(),
+                "clock_s": float(values[block.edge + 1]),
+                "clock_sigma_s": float(sigmas[block.edge + 1]),
+                "row_time_s": float(values[block.edge + 2]),
+                "held_out_rmse_px": float(np.sqrt(np.nanmean(lengths_px**2))),
+                "held_out_median_px": float(np.nanmedian(lengths_px)),
+            }
+        )
+    return rows
 
 
 def plan_table(found: PlannedFloor) -> Rows:

@@ -100,7 +100,7 @@ def fit_jointly(
         The observations do not determine the cameras.
     """
     check_observations(observations)
-    observations = _without_unseen(observations)
+    observations = without_unseen(observations)
     try:
         placed = place_cameras(observations) if placed is None else placed
         return _fit(observations, settings or JointSettings(), placed, progress)
@@ -137,7 +137,7 @@ def fit_shape(
         )
         for point in observations.points
     )
-    untaped = _without_unseen(replace(observations, points=points))
+    untaped = without_unseen(replace(observations, points=points))
     # One estimate of the floor is enough for a shape.
     settings = replace(settings, floor_sigma_spread=0.0)
     held = max(range(len(placed)), key=lambda camera: len(observations.sightings[camera]))
@@ -282,7 +282,7 @@ def _with_floor(fit: JointFit, factor: float) -> tuple[Problem, State]:
     return problem, replace(fit.state, values=values)
 
 
-def _without_unseen(observations: Observations) -> Observations:
+def without_unseen(observations: Observations) -> Observations:
     """Return the observations without calibration points that no camera saw: they determine nothing."""
     seen = np.unique(np.concatenate([sightings.point for sightings in observations.sightings]))
     seen = seen[seen >= 0]
@@ -343,7 +343,11 @@ def _make_factors(
 
 def _floor(placed: list[PlacedCamera], settings: JointSettings) -> FloorField:
     points_m = np.concatenate([camera.points_m[:, :2] for camera in placed])
-    points_m = points_m[np.isfinite(points_m).all(axis=1)]
+    return usual_floor(points_m[np.isfinite(points_m).all(axis=1)], settings)
+
+
+def usual_floor(points_m: Array, settings: JointSettings) -> FloorField:
+    """Return the field of a floor around places (n, 2) on it."""
     low_m, high_m = np.percentile(points_m, [1, 99], axis=0)
     low_m, high_m = low_m - _BEYOND_M, high_m + _BEYOND_M
     # The number of modes must not grow with a hall: only its longer waves are estimated.

@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ipsys_log.calibration.joint.fit import JointFit
@@ -26,7 +27,7 @@ from ipsys_log.calibration.joint.trajectories import Kind, Paths, Trajectories
 from ipsys_log.errors import FitError
 from ipsys_log.messages import Array, Indices
 from ipsys_log.vision.lenses import undistort
-from ipsys_log.vision.poses import make_pose
+from ipsys_log.vision.poses import make_pose, rotation
 
 # Views of two cameras within this time show nearly the same pose of the body.
 _SAME_TIME_S = 0.05
@@ -35,8 +36,10 @@ _POSE_M, _POSE_RAD = 0.01, 0.02
 _ONE_FRAME_S = 0.015
 # The smallest number of points that have a pose, and the share of their extent up to which they are a plane.
 _LEAST_POINTS, _FLAT = 4, 1e-3
-# A longer time without sightings divides a path. The parts of a path that turns far are not shorter than this.
+# A longer time without sightings divides a path. The parts of a path that turns far are not shorter.
 _GAP_S, _SHORTEST_PART_S = 1.0, 0.5
+# A part with fewer instants, or of less than two intervals of knots, has no path.
+_LEAST_SIGHTINGS = 6
 _FAR_RAD = 2.0
 _FEW = 200
 # Before the velocity of the body is known, a step need not be so exact, in standard deviations.
@@ -101,10 +104,17 @@ def _solve(
 
 
 def _with_jitter(problem: Problem, state: State, jitter_s: float) -> Problem:
+    """Return the problem with errors of the frames' times as noise of the corners.
+
+    The markers of a frame share one error. White noise of their number times its variance has the same effect
+    on all unknowns that change slowly.
+    """
     return replace(
         problem,
         sightings=tuple(
-            factors.jittered(state, problem.layout, problem.trajectories, jitter_s)
+            factors.jittered(
+                state, problem.layout, problem.trajectories, jitter_s * _sharing(factors.sightings)
+            )
             if factors.kind is Kind.FREE
             else factors
             for factors in problem.sightings
@@ -112,9 +122,15 @@ def _with_jitter(problem: Problem, state: State, jitter_s: float) -> Problem:
     )
 
 
-def fit_motion(
-    fit: JointFit, progress: Callable[[int, float], None] = lambda step, cost: None
-) -> JointFit:
+def _sharing(sightings: Sightings) -> Array:
+    """Return the root of the number of sightings in the frame of each sighting, (n,)."""
+    counts = np.ones(len(sightings))
+    for rows in _frames(sightings):
+        counts[rows] = len(rows)
+    return np.asarray(np.sqrt(counts))
+
+
+def fit_motion(fit: JointFit, progress: Callable[[int, float], None] = lambda step, cost: None) -> JointFit:
     """Return the fit with the jerk of the body and the jitter of the stamps that the frames show.
 
     Both are standard deviations before the fit. Those are taken for which the observations are most likely,
@@ -162,12 +178,12 @@ def _improbability(fit: JointFit) -> float:
 
 
 def corner_sigma(fit: JointFit) -> float:
-    """Return the standard deviation of a corner in px: the errors within images, beside any pose of the body."""
+    """Return the standard deviation of a corner in px: errors within images, beside any pose of the body."""
     squares, freedom = 0.0, 0
     problem = fit.problem
-    for factors in problem.sightings:
-        visible = np.repeat(np.isfinite(factors.sightings.pixels[:, :, 0]), 2, axis=1)
-        factors = replace(factors, whitening=np.eye(visible.shape[1]) * visible[:, :, None])
+    for weighted in problem.sightings:
+        visible = np.repeat(np.isfinite(weighted.sightings.pixels[:, :, 0]), 2, axis=1)
+        factors = replace(weighted, whitening=np.eye(visible.shape[1]) * visible[:, :, None])
         place = factors.place(fit.state, problem.layout, problem.trajectories)
         by_pose = factors.slopes(place, fit.state, problem.layout).by_pose * visible[:, :, None]
         errors_px = factors.residuals(fit.state, problem.layout, problem.trajectories)
@@ -202,19 +218,56 @@ def predict_errors(fit: JointFit, camera: int, sightings: Sightings) -> Array:
     return np.where(visible, errors_px.reshape(visible.shape), np.nan)
 
 
+def hold_out_halves(
+    fit: JointFit, progress: Callable[[int, int], None] = lambda done, total: None
+) -> list[Array]:
+    """Return the reprojection errors (n, p, 2) of the moving sightings of each camera, in fits without them.
+
+    Each fit leaves out half of the time of one camera. The path then comes from the other cameras, and the
+    pose and the clock of the camera from its other half. Sightings count at which another camera sees the
+    body at nearly the same time: nothing else predicts its pose.
+    """
+    observations, errors = fit.observations, []
+    count = len(observations.cameras)
+    paths = fit.problem.trajectories.free_paths
+    step_s = float(paths.steps_s[0])
+    for camera, own in enumerate(observations.sightings):
+        moving = (own.point < 0) & _covers(paths, own.times_s)
+        half_s = np.median(own.times_s[moving])
+        shared = _shares(observations, camera)
+        parts = []
+        for number, out in enumerate((moving & (own.times_s < half_s), moving & (own.times_s >= half_s))):
+            kept = [*observations.sightings]
+            kept[camera] = own.select(~out)
+            rest = fit_hand_held(replace(observations, sightings=tuple(kept)), fit.settings, step_s)
+            parts.append(predict_errors(rest, camera, own.select(out & shared)))
+            progress(2 * camera + number + 1, 2 * count)
+        errors.append(np.concatenate(parts))
+    return errors
+
+
+def _shares(observations: Observations, camera: int) -> NDArray[np.bool_]:
+    """Return a mask of the sightings of a camera near which another camera sees the body."""
+    others = [own for number, own in enumerate(observations.sightings) if number != camera]
+    known_s = np.sort(np.concatenate([own.times_s[own.point < 0] for own in others]))
+    times_s = observations.sightings[camera].times_s
+    if not len(known_s):
+        return np.zeros(len(times_s), dtype=np.bool_)
+    after = np.clip(np.searchsorted(known_s, times_s), 1, max(len(known_s) - 1, 1))
+    near_s = np.minimum(
+        *(np.abs(times_s - known_s[np.minimum(n, len(known_s) - 1)]) for n in (after, after - 1))
+    )
+    return np.asarray(near_s < _SAME_TIME_S)
+
+
 def _view(observations: Observations, camera: int) -> Array:
     """Return ``camera_from_body`` (n, 4, 4) of each sighting, from all sightings of its frame."""
     sightings, lens = observations.sightings[camera], observations.cameras[camera].lens
     poses = np.full((len(sightings), 4, 4), np.nan)
     for rows in _frames(sightings):
-        visible = [np.isfinite(sightings.pixels[row, :, 0]) for row in rows]
-        points_m = np.concatenate(
-            [
-                observations.bodies[int(sightings.body[row])].points_m[seen]
-                for row, seen in zip(rows, visible, strict=True)
-            ]
-        )
-        pixels = np.concatenate([sightings.pixels[row, seen] for row, seen in zip(rows, visible, strict=True)])
+        visible = np.isfinite(sightings.pixels[rows, :, 0])
+        bodies = [observations.bodies[body].points_m for body in sightings.body[rows].tolist()]
+        points_m, pixels = np.stack(bodies)[visible], sightings.pixels[rows][visible]
         pose = _pose_of(points_m, undistort(pixels, lens))
         if pose is not None:
             poses[rows] = pose
@@ -230,16 +283,16 @@ def _frames(sightings: Sightings) -> list[list[int]]:
 
 
 def _pose_of(points_m: Array, uv: Array) -> Array | None:
-    """Return ``camera_from_body`` (4, 4) of points (n, 3) in the plane at depth 1; None without a solution."""
+    """Return ``camera_from_body`` (4, 4) from points (n, 3) and their undistorted places (n, 2), or None."""
     usable = np.isfinite(uv).all(axis=1)
     points_m, uv = points_m[usable], uv[usable]
     if len(points_m) < _LEAST_POINTS:
         return None
     spread_m = np.linalg.svd(points_m - points_m.mean(axis=0), compute_uv=False)
     flat = spread_m[2] < _FLAT * spread_m[0]
-    method = cv2.SOLVEPNP_IPPE if flat else cv2.SOLVEPNP_SQPNP
+    method = cv2.SOLVEPNP_IPPE if flat else cv2.SOLVEPNP_EPNP
     good, turn, shift_m = cv2.solvePnP(points_m, uv, np.eye(3), np.zeros(5), flags=method)
-    return make_pose(cv2.Rodrigues(turn)[0], shift_m[:, 0]) if good else None
+    return make_pose(rotation(np.ravel(turn)), np.ravel(shift_m)) if good else None
 
 
 def _chain_cameras(observations: Observations, views: list[Array]) -> list[Array]:
@@ -307,7 +360,8 @@ def _build(
     )
     factors = []
     for camera, sightings in enumerate(observations.sightings):
-        for kind, rows in ((Kind.STATIONARY, sightings.point >= 0), (Kind.FREE, sightings.point < 0)):
+        moving = (sightings.point < 0) & _covers(paths, sightings.times_s)
+        for kind, rows in ((Kind.STATIONARY, sightings.point >= 0), (Kind.FREE, moving)):
             if rows.any():
                 own = sightings.select(rows)
                 number = own.point if kind is Kind.STATIONARY else _path_at(paths, own.times_s)
@@ -361,11 +415,15 @@ def _start_points(observations: Observations, world: list[Array]) -> Array:
 def _start_path(
     observations: Observations, world: list[Array], settings: JointSettings, step_s: float
 ) -> tuple[Paths, Array, Array]:
-    """Return paths through all moving sightings, their mean orientations (i, 3, 3), and their knots (k, 6)."""
+    """Return paths through all moving sightings, their mean orientations (i, 3, 3), and knots (k, 6)."""
     times_s, poses = _moving_poses(observations, world)
     if not len(times_s):
         return Trajectories(0).free_paths, np.zeros((0, 3, 3)), np.zeros((0, 6))
-    parts = _divide(times_s, Rotation.from_matrix(poses[:, :3, :3]), np.arange(len(times_s)))
+    parts = [
+        rows
+        for rows in _divide(times_s, Rotation.from_matrix(poses[:, :3, :3]), np.arange(len(times_s)))
+        if len(np.unique(times_s[rows])) >= _LEAST_SIGHTINGS and np.ptp(times_s[rows]) > 2 * step_s
+    ]
     columns, first = [], 0
     for rows in parts:
         own = cover_times(times_s[rows], step_s)
@@ -374,6 +432,8 @@ def _start_path(
     starts_s, steps_s, firsts, counts = (np.array(column) for column in zip(*columns, strict=True))
     paths = Paths(starts_s, steps_s, firsts, counts, np.zeros(len(parts), dtype=np.intp))
     middles = [_middle(Rotation.from_matrix(poses[rows, :3, :3])) for rows in parts]
+    near = _covers(paths, times_s)
+    times_s, poses = times_s[near], poses[near]
     numbers = _path_at(paths, times_s)
     turned = [
         (Rotation.from_matrix(pose[:3, :3]) * middles[number].inv()).as_rotvec()
@@ -425,6 +485,13 @@ def _middle(turns: Rotation) -> Rotation:
     """Return the orientation that is nearest to all others."""
     some = turns[:: max(1, len(turns) // _FEW)]
     return some[int(np.abs(some.as_quat() @ turns.as_quat().T).sum(axis=1).argmax())]
+
+
+def _covers(paths: Paths, times_s: Array) -> NDArray[np.bool_]:
+    """Return a mask of the times at which a path has sightings."""
+    ends_s = paths.starts_s + (paths.counts - 2) * paths.steps_s - PAD_S
+    inside = (times_s[:, None] >= paths.starts_s + PAD_S) & (times_s[:, None] <= ends_s)
+    return np.asarray(inside.any(axis=1))
 
 
 def _path_at(paths: Paths, times_s: Array) -> Indices:

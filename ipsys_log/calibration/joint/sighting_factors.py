@@ -210,13 +210,14 @@ class SightingFactors:
         return replace(self, whitening=_whitening(self.variances + tilts @ tilts.swapaxes(1, 2)))
 
     def jittered(
-        self, state: State, layout: Layout, trajectories: Trajectories, jitter_s: float
+        self, state: State, layout: Layout, trajectories: Trajectories, jitter_s: Array
     ) -> SightingFactors:
-        """Return these factors with random errors of the frames' times as noise of their points."""
+        """Return these factors with random errors of their times, ``jitter_s`` (n,), as noise of points."""
         place = self.place(state, layout, trajectories)
         clock = layout.cameras[self.camera].edge + 1 - layout.cameras[self.camera].start
         by_time = self.slopes(place, state, layout).by_global[:, :, clock : clock + 1] * self._visible
-        noise = jitter_s**2 * by_time @ by_time.swapaxes(1, 2)
+        by_time = by_time * jitter_s[:, None, None]
+        noise = by_time @ by_time.swapaxes(1, 2)
         return replace(self, whitening=_whitening(self.variances + noise) * self._visible)
 
     @property

@@ -32,7 +32,8 @@ from ipsys_log.calibration.board import Board
 from ipsys_log.calibration.board_detection import LEAST_CORNERS, find_board
 from ipsys_log.calibration.images import find_sources
 from ipsys_log.calibration.joint.fit import JointFit
-from ipsys_log.calibration.joint.hand_held import fit_hand_held, predict_errors
+from ipsys_log.calibration.joint.hand_held import fit_hand_held
+from ipsys_log.calibration.joint.held_out import predict_errors
 from ipsys_log.calibration.joint.observations import (
     Body,
     CalibrationPoint,

@@ -230,18 +230,23 @@ def _log(path: Path, requested: bool) -> list[ImageSource]:
 
 def _read_log(path: Path, topic: str, stride: int) -> Iterator[tuple[str, Grey | None]]:
     with Session([path]) as session:
-        video: Video | None = None
-        for number, message in enumerate(session.messages([topic])):
-            frame, wanted = message.payload, number % stride == 0
-            if isinstance(frame, CompressedVideo):
-                video = video or Video(frame.format)
-                if wanted:
-                    frame = _of_video(video, frame)
-                else:
-                    video.skip(frame)
+        for time_ns, grey in read_frames(session, topic, stride):
+            yield f"at {(time_ns - session.start_ns) * 1e-9:.2f} s", grey
+
+
+def read_frames(session: Session, topic: str, stride: int = 1) -> Iterator[tuple[int, Grey | None]]:
+    """Yield the time of each frame of a camera in ns, and its image; None for an unreadable image."""
+    video: Video | None = None
+    for number, message in enumerate(session.messages([topic])):
+        frame, wanted = message.payload, number % stride == 0
+        if isinstance(frame, CompressedVideo):
+            video = video or Video(frame.format)
             if wanted:
-                seconds = (message.publish_time_ns - session.start_ns) * 1e-9
-                yield f"at {seconds:.2f} s", None if frame is None else _frame(frame)
+                frame = _of_video(video, frame)
+            else:
+                video.skip(frame)
+        if wanted:
+            yield message.publish_time_ns, None if frame is None else _frame(frame)
 
 
 def _of_video(video: Video, frame: CompressedVideo) -> RawImage | None:

@@ -7,16 +7,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ipsys_log.calibration.joint.carried_observations import gather_carried
+from ipsys_log.calibration.board import Board
+from ipsys_log.calibration.board_detection import BoardSighting, find_board
+from ipsys_log.calibration.images import read_frames
+from ipsys_log.calibration.joint.carried_observations import BOARD, gather_board, gather_carried
 from ipsys_log.calibration.joint.fit import JointFit
-from ipsys_log.calibration.joint.hand_held import fit_hand_held, fit_motion, hold_out_halves
-from ipsys_log.calibration.joint.lab_frame import LabFrame, apply_frame, find_frame
-from ipsys_log.calibration.joint.payload import joint_payload
+from ipsys_log.calibration.joint.hand_held import fit_hand_held, fit_motion
+from ipsys_log.calibration.joint.held_out import corner_sigma, distance_errors, hold_out_halves
+from ipsys_log.calibration.joint.lab_frame import LabFrame, Target, apply_frame, find_frame, first_camera
+from ipsys_log.calibration.joint.observations import Observations
+from ipsys_log.calibration.joint.payload import JOINT, joint_payload
 from ipsys_log.calibration.joint.settings import JointSettings
 from ipsys_log.engine.provenance import fingerprint, free_name, newest_run, read_channels
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import IMPORTED, CameraCalibration, Interval, Markers, Message, Rig, Run
+from ipsys_log.messages import IMPORTED, Array, CameraCalibration, Interval, Markers, Message, Rig, Run
 from ipsys_log.messages.channels import MARKERS, MEASUREMENTS, MODEL
 from ipsys_log.statistics.calibration_points import active_measurements
 from ipsys_log.statistics.joint_evaluation import is_nominal
@@ -25,6 +30,18 @@ from ipsys_log.vision.bodies import body_shapes
 # Between a body that lies on the floor and its marker: paper and plates bend by half a millimetre.
 _LAID_TILT_RAD = 0.001
 _CONTRADICTED = 4.0  # standard deviations
+# A board needs no intrinsics from a chessboard: it determines them.
+_BOARD_SETTINGS = JointSettings(
+    focal_sigma=0.02, centre_sigma=0.01, distortion_sigma=0.05, edge_sigma_px=0.0, corner_floor_px=0.0,
+    clock_sigma_s=0.2,
+)  # fmt: skip
+_BOARD_SCALE_SIGMA = 0.001
+_ROUNDS = 2
+# Time between knots of the path: half the usual interval of the frames, within these limits.
+_SHORTEST_STEP_S, _LONGEST_STEP_S = 0.05, 0.1
+
+
+Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,6 +55,8 @@ class CarriedLab:
     frame : these coordinates, in those of the first camera.
     rest : the time at which the body at rest defines the coordinates; None: measured points define them.
     held_out_px : reprojection errors of each camera, (n, 4, 2), in frames that were not in the fit.
+    distance_errors_m : (n,), of neighbouring points of a board that two cameras measure at held-out instants;
+        none for a body of markers.
     remarks : what contradicts the rig or the tape.
     """
 
@@ -45,7 +64,8 @@ class CarriedLab:
     fit: JointFit
     frame: LabFrame
     rest: Interval | None
-    held_out_px: Mapping[str, np.ndarray]
+    held_out_px: Mapping[str, Array]
+    distance_errors_m: Array
     remarks: tuple[str, ...]
 
 
@@ -54,7 +74,7 @@ def calibrate_carried_lab(
     robot: str,
     rig: Rig,
     lenses: Mapping[str, CameraCalibration],
-    progress: Callable[[str, int, int], None] = lambda what, done, total: None,
+    progress: Progress = lambda what, done, total: None,
 ) -> tuple[CarriedLab, Run, Message]:
     """Estimate poses, clocks and intrinsics of all cameras; return them, and the run that stores the model.
 
@@ -79,25 +99,94 @@ def calibrate_carried_lab(
     for message in session.messages(topics):
         markers.setdefault(str(message.camera), []).append(message.payload)
     markers = {camera: own for camera, own in markers.items() if any(one.markers for one in own)}
-    nominal = {camera for camera in markers if camera in lenses and is_nominal(lenses[camera])}
     measured = active_measurements(session.payloads(session.topics(MEASUREMENTS)))
-    observations, targets, rest = gather_carried(rig, lenses, nominal, markers, robot, measured)
-    progress("fit", 0, 0)
-    fit = fit_motion(
-        fit_hand_held(observations, JointSettings(), progress=lambda n, cost: progress("fit", n, 0))
-    )
-    frame = find_frame(fit, targets)
-    held_out = hold_out_halves(fit, lambda done, total: progress("hold out", done, total))
+    gathered = gather_carried(rig, lenses, _nominal(lenses), markers, robot, measured)
     scale_sigma = next(shape.scale_sigma for shape in body_shapes(rig) if shape.robot == robot)
-    middle_m = np.mean([target.position_m for target in targets], axis=0)
-    in_lab = apply_frame(fit, frame, _LAID_TILT_RAD if rest is not None else 0.0, scale_sigma, middle_m)
-    names = [camera.name for camera in observations.cameras]
-    remarks = _remarks(frame, rest)
-    lab = CarriedLab(robot, in_lab, frame, rest, dict(zip(names, held_out, strict=True)), remarks)
-    return lab, *_record(session, lab, run, topics)
+    fit = fit_motion(_fit(gathered[0], JointSettings(), progress))
+    lab = _describe(robot, fit, *gathered[1:], scale_sigma, progress)
+    return lab, *_record(session, lab, (run,), [*topics, *session.topics(MEASUREMENTS)])
 
 
-def _remarks(frame: LabFrame, rest: Interval | None) -> tuple[str, ...]:
+def calibrate_with_board(
+    session: Session,
+    board: Board,
+    lenses: Mapping[str, CameraCalibration],
+    progress: Progress = lambda what, done, total: None,
+) -> tuple[CarriedLab, Run, Message]:
+    """Do the same with a board in the frames of the log.
+
+    Raises
+    ------
+    IpsysError
+        The log has no frames, no camera sees the board, or the frames do not determine the cameras.
+    """
+    if not session.images:
+        raise IpsysError(f"{session}: has no frames of a board; record them, or use a body with --body")
+    sightings, done = dict[str, list[tuple[int, BoardSighting]]](), 0
+    total = sum(session.count(topic) for topic in session.images.values())
+    for camera, topic in sorted(session.images.items()):
+        for time_ns, grey in read_frames(session, topic):
+            seen = None if grey is None else find_board(camera, grey, board, thorough=False)
+            if seen is not None:
+                sightings.setdefault(camera, []).append((time_ns, seen))
+            done += 1
+            progress("find board", done, total)
+    if not sightings:
+        raise IpsysError(f"{session}: no frame shows {board}; check --board, --dictionary and --inverted")
+    observations, targets, rest = gather_board(lenses, _nominal(lenses), sightings, board)
+    fit = _fit(observations, _BOARD_SETTINGS, progress)
+    for _ in range(_ROUNDS):
+        size = 2 * observations.bodies[0].points_m.shape[0]
+        covariance = corner_sigma(fit) ** 2 * np.eye(size)
+        tables = tuple(
+            replace(own, covariances_px2=np.tile(covariance, (len(own), 1, 1)))
+            for own in fit.observations.sightings
+        )
+        fit = fit_motion(_fit(replace(observations, sightings=tables), fit.settings, progress))
+    lab = _describe(str(board), fit, targets, rest, _BOARD_SCALE_SIGMA, progress)
+    return lab, *_record(session, lab, (), list(session.images.values()))
+
+
+def _nominal(lenses: Mapping[str, CameraCalibration]) -> set[str]:
+    return {camera for camera, lens in lenses.items() if is_nominal(lens)}
+
+
+def _fit(observations: Observations, settings: JointSettings, progress: Progress) -> JointFit:
+    intervals_s = np.concatenate([np.diff(own.times_s[own.point < 0]) for own in observations.sightings])
+    usual_s = float(np.median(intervals_s[intervals_s > 0])) if (intervals_s > 0).any() else _LONGEST_STEP_S
+    step_s = float(np.clip(usual_s / 2, _SHORTEST_STEP_S, _LONGEST_STEP_S))
+    return fit_hand_held(observations, settings, step_s, lambda step, cost: progress("fit", step, step + 1))
+
+
+def _describe(
+    body: str,
+    fit: JointFit,
+    targets: Sequence[Target],
+    rest: Interval | None,
+    scale_sigma: float,
+    progress: Progress,
+) -> CarriedLab:
+    """Return the cameras in the coordinates of the lab, with their errors in held-out frames."""
+    frame = find_frame(fit, targets) if targets else first_camera(fit)
+    errors_px = hold_out_halves(fit, lambda done, total: progress("hold out", done, total))
+    # The size of the body scales all lengths about the places that are known.
+    known_m = [np.zeros(3)] if rest is not None or not targets else [one.position_m for one in targets]
+    tilt_rad = 0.0 if rest is None else _LAID_TILT_RAD
+    in_lab = apply_frame(fit, frame, tilt_rad, scale_sigma, np.mean(known_m, axis=0))
+    in_lab = replace(in_lab, is_certain=bool(targets))
+    names = [camera.name for camera in fit.observations.cameras]
+    remarks = _remarks(frame, rest, names[0] if not targets else None)
+    held_out = dict(zip(names, errors_px, strict=True))
+    distances_m = distance_errors(fit) if fit.observations.bodies[0].name == BOARD else np.zeros(0)
+    return CarriedLab(body, in_lab, frame, rest, held_out, distances_m, remarks)
+
+
+def _remarks(frame: LabFrame, rest: Interval | None, camera: str | None) -> tuple[str, ...]:
+    if camera is not None:
+        return (
+            f"the coordinates are those of camera {camera}: fewer than two measured points are seen, and the "
+            "body is never at rest. Lay it onto the floor for 3 s, or measure two points some metres apart",
+        )
     name, score = frame.worst
     if rest is not None or frame.freedom < 1 or score < _CONTRADICTED:
         return ()
@@ -107,20 +196,20 @@ def _remarks(frame: LabFrame, rest: Interval | None) -> tuple[str, ...]:
     )
 
 
-def _record(session: Session, lab: CarriedLab, run: str, topics: Sequence[str]) -> tuple[Run, Message]:
-    topics = [*topics, *session.topics(MEASUREMENTS)]
+def _record(
+    session: Session, lab: CarriedLab, runs: tuple[str, ...], topics: Sequence[str]
+) -> tuple[Run, Message]:
     log_time_ns, time_ns = session.last(topics)
     record = Run(
         time_ns,
         "",
         IMPORTED,
-        {"format": "carried body", "robot": lab.robot, "model": "joint"},
+        {"format": "carried body", "body": lab.robot, "model": JOINT},
         fingerprint(),
-        input_runs=(run,),
+        input_runs=runs,
         inputs=read_channels(session, topics),
         number=max((own.number for own in session.runs()), default=0) + 1,
     )
-    record = replace(record, run=free_name(session, record, "joint", ()))
-    return record, Message(
-        MODEL.topic_of(record.run), log_time_ns, time_ns, joint_payload(lab.fit, {}, time_ns)
-    )
+    record = replace(record, run=free_name(session, record, JOINT, ()))
+    model = joint_payload(lab.fit, {}, time_ns)
+    return record, Message(MODEL.topic_of(record.run), log_time_ns, time_ns, model)

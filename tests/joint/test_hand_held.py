@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from ipsys_log.calibration.joint.fit import JointFit
-from ipsys_log.calibration.joint.hand_held import fit_hand_held, predict_errors
+from ipsys_log.calibration.joint.hand_held import fit_hand_held
+from ipsys_log.calibration.joint.held_out import predict_errors
 from ipsys_log.calibration.joint.observations import (
     Body,
     CalibrationPoint,

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from ipsys_log.app.cli import lab_inputs
 from ipsys_log.app.cli import options as cli
+from ipsys_log.app.cli.calibrate import Dictionary, Inverted, MarkerScale, Square
 from ipsys_log.app.cli.console import print_result, progress_bar, say
 from ipsys_log.app.cli.open_cameras import check_target, open_cameras, prepare_lab
 from ipsys_log.app.cli.options import figure_option, log_argument, log_option, setting, switch
@@ -20,6 +21,7 @@ from ipsys_log.extras import check_installed
 from ipsys_log.log.location import LogLocation
 
 if TYPE_CHECKING:
+    from ipsys_log.calibration.board import Board
     from ipsys_log.engine.request import Request
     from ipsys_log.live_runs.survey.lab_calibration import LabCalibration
     from ipsys_log.messages import Rig
@@ -60,6 +62,12 @@ CarriedBody = Annotated[
         "Use this body of the rig, which is carried by hand. Cameras may hang on walls.",
     ),
 ]
+CarriedBoard = Annotated[
+    str | None,
+    setting(
+        "--board", "COLUMNSxROWS", "Use a board in the frames that is carried by hand, such as charuco:4x5."
+    ),
+]
 _LEAST_POINTS = 2
 
 
@@ -67,6 +75,11 @@ def calibrate_lab(
     logs: Sources = None,
     goal_mm: Goal = 3.0,
     body: CarriedBody = None,
+    board: CarriedBoard = None,
+    square: Square = 0.03,
+    marker_scale: MarkerScale = 0.75,
+    dictionary: Dictionary = "DICT_4X4_50",
+    inverted: Inverted = False,
     focal: lab_inputs.Focal = None,
     field_of_view: lab_inputs.FieldOfView = None,
     train: cli.Train = "train",
@@ -89,9 +102,9 @@ def calibrate_lab(
     If it is not, the command names points to measure and a part of the floor to drive through. Without a
     tape: lay a marker on each of two reference points, and enter 0 as its distance.
 
-    With --body, the command needs no level floor in view: carry the body through the fields of view, each
-    shared by two cameras, then lay it down for 3 s where the origin of the lab is to be. Measured points, if
-    there are two, define the coordinates instead. The command estimates poses, intrinsics and clocks.
+    With --body or --board, no camera needs a level floor in view. Carry the body through the fields of view,
+    where two cameras see it. Then lay it down for 3 s: it defines the coordinates of the lab, unless there
+    are two measured points. The command estimates poses, intrinsics and clocks of all cameras.
 
     Without LOG, the command records the cameras of --rig into -o until Ctrl-C. Meanwhile it prints the
     expected error, and takes the measured points on a page.
@@ -102,7 +115,9 @@ def calibrate_lab(
         ipsys calibrate-lab lab.mcap --goal-mm 2           # is 2 mm reached?
         ipsys calibrate-lab lab.mcap --field-of-view 105   # without a chessboard
         ipsys calibrate-lab carry.mcap --body wand         # cameras on walls
+        ipsys calibrate-lab board.mcap --board charuco:4x5 --square 0.054
     """
+    from ipsys_log.calibration.board import parse_board
     from ipsys_log.engine.graph import writes
     from ipsys_log.engine.request import Request
     from ipsys_log.messages.channels import MODEL
@@ -124,7 +139,8 @@ def calibrate_lab(
         # The log has the rig and the intrinsics of its cameras.
         logs, output, rig, calibration, nominal = [output], None, None, None, []
     given_rig = lab_inputs.load_matching_rig(rig, lambda: lab_inputs.cameras_of(logs))
-    _check(logs, given_rig)
+    if board is None:
+        _check(logs, given_rig)
     lenses = lab_inputs.load_calibrations(calibration, lambda: lab_inputs.cameras_of(logs))
     nominal_values = lab_inputs.nominal_lenses_of_logs(logs, lenses, nominal)
     if save_nominal is not None:
@@ -132,10 +148,12 @@ def calibrate_lab(
     lenses = {**lenses, **nominal_values}
     given: dict[str, Any] = {"model": ["joint"], "lenses": lenses, "train": train}
     given |= {"rig": rig, "calibration": None, "corners": corners, "run": None}
-    if body is not None:
-        if plot is not None:
-            raise IpsysError("--plot draws the floor of drives; leave it out with --body")
-        _calibrate_carried(logs, body, given_rig, given, output, as_json)
+    if body is not None or board is not None:
+        if plot is not None or (body is not None and board is not None):
+            other = "--plot" if plot is not None else "--board"
+            raise IpsysError(f"{other} cannot be used with {'--board' if body is None else '--body'}")
+        carried = body or parse_board(board or "", square, marker_scale, dictionary, inverted)
+        _calibrate_carried(logs, carried, given_rig, given, output, as_json)
         return
     with derive(logs, "fit", output, **given) as (session, outcomes, _):
         run = next(outcome.run for outcome in reversed(outcomes) if writes(outcome, MODEL))
@@ -152,7 +170,7 @@ def calibrate_lab(
 
 def _calibrate_carried(
     logs: Sequence[LogLocation],
-    body: str,
+    body: str | Board,
     rig: Rig | None,
     given: dict[str, Any],
     output: Path | None,
@@ -164,20 +182,24 @@ def _calibrate_carried(
     from ipsys_log.engine.provenance import newest_run
     from ipsys_log.log.dataset import Session
     from ipsys_log.messages.channels import MARKERS
-    from ipsys_log.tools.carried_lab import calibrate_carried_lab
+    from ipsys_log.tools.carried_lab import calibrate_carried_lab, calibrate_with_board
 
     with Session(logs) as session:
         has_images = bool(session.images)
-    if has_images:  # else another program has detected the markers
+    if has_images and isinstance(body, str):  # without images, another program has detected the markers
         with derive(logs, "detect", output, **given):
             pass
     sources, target = choose_target(logs, output)
     if target is not None and target.exists():
         sources, target = [*sources, target], None
     with Session(sources) as session, progress_bar() as progress:
-        run = newest_run(session, MARKERS) or ""
-        in_force, lenses = lab_inputs.lab_of_run(session, run, rig, given["lenses"])
-        lab, record, message = calibrate_carried_lab(session, body, in_force, lenses, progress)
+        if isinstance(body, str):
+            run = newest_run(session, MARKERS) or ""
+            in_force, lenses = lab_inputs.lab_of_run(session, run, rig, given["lenses"])
+            lab, record, message = calibrate_carried_lab(session, body, in_force, lenses, progress)
+        else:
+            lenses = lab_inputs.lenses_of(session, given["lenses"])
+            lab, record, message = calibrate_with_board(session, body, lenses, progress)
     with open_target(sources, target) as (_, log):
         append_run(log, record, message.log_time_ns, lambda: [message], {})
     print_result({"run": record.run, **carried_json(lab)}, [carried_table(lab), *carried_lines(lab)], as_json)

@@ -168,9 +168,14 @@ def lab_of_run(
     from ipsys_log.messages.channels import RIG
     from ipsys_log.sinks.selection import rig_in_force
 
-    recorded = {camera: session.payloads([topic])[-1] for camera, topic in session.calibrations.items()}
     in_force = rig or rig_in_force(session, [run]) or session.payloads(session.topics(RIG))[-1]
-    return in_force, {**recorded, **lenses}
+    return in_force, lenses_of(session, lenses)
+
+
+def lenses_of(session: Session, lenses: Mapping[str, CameraCalibration]) -> dict[str, CameraCalibration]:
+    """Return the intrinsics of all cameras: the given ones, else those of the log."""
+    recorded = {camera: session.payloads([topic])[-1] for camera, topic in session.calibrations.items()}
+    return {**recorded, **lenses}
 
 
 def load_lab(

@@ -263,8 +263,14 @@ def carried_lines(lab: CarriedLab) -> Iterator[str]:
             f"Coordinates: those of {lab.robot} at rest, for {seconds:.1f} s. They are level to about 1 mm "
             "for each metre; measured points are better for robots on the floor."
         )
-    else:
+    elif lab.fit.is_certain:
         yield "Coordinates: those of the measured points."
+    if len(lab.distance_errors_m):
+        rms_m = float(np.sqrt(np.mean(lab.distance_errors_m**2)))
+        yield wrap_text(
+            f"Squares of the board, measured by two cameras at held-out instants: RMS error {mm(rms_m, 2)} "
+            f"mm in {len(lab.distance_errors_m)} distances."
+        )
     settings = lab.fit.settings
     yield wrap_text(
         f"Motion: jerk {settings.jerk_density:.1g} m/s^2.5; jitter of the stamps "
@@ -282,6 +288,7 @@ def carried_json(lab: CarriedLab) -> dict[str, Any]:
         "stamp_jitter_s": lab.fit.settings.stamp_jitter_s,
         "jerk_density": lab.fit.settings.jerk_density,
         "cameras": _carried_cameras(lab),
+        "distance_errors_m": lab.distance_errors_m.tolist(),
         "remarks": list(lab.remarks),
     }
 

@@ -1,16 +1,24 @@
-"""Observations of a carried body from the messages of a log, and known poses of stationary markers."""
+"""Observations of a carried body or board from a log, and known poses of stationary markers."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from ipsys_log.calibration.board import Board
+from ipsys_log.calibration.board_detection import BoardSighting
 from ipsys_log.calibration.joint.fit import without_unseen
 from ipsys_log.calibration.joint.from_messages import gather_observations
 from ipsys_log.calibration.joint.lab_frame import Target
-from ipsys_log.calibration.joint.observations import Body, CalibrationPoint, Observations, Sightings
+from ipsys_log.calibration.joint.observations import (
+    Body,
+    CalibrationPoint,
+    CameraPrior,
+    Observations,
+    Sightings,
+)
 from ipsys_log.calibration.joint.settings import JointSettings
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Array, CameraCalibration, Interval, Marker, Markers, Measurement, Rig
@@ -26,8 +34,12 @@ _GAP_NS = NS_PER_S // 2
 _LEAST_STEP_NS = NS_PER_S // 16
 _UNKNOWN_CORNER_PX = 0.25
 # A pose of a marker on its body is exact beside the errors of the cameras.
-_ON_BODY_M, _ON_BODY_RAD = 1e-5, 1e-4
+_EXACT = np.repeat([1e-5, 1e-4], 3)
 _REST = "rest"
+# The name of the only body of the sightings of a board.
+BOARD = "board"
+# Before the fit shows the errors of the corners of a board.
+_BOARD_CORNER_PX = 0.3
 
 
 def gather_carried(
@@ -80,6 +92,59 @@ def gather_carried(
     return observations, [target for target in targets if target is not None], rest
 
 
+def gather_board(
+    lenses: Mapping[str, CameraCalibration],
+    nominal: Collection[str],
+    sightings: Mapping[str, Sequence[tuple[int, BoardSighting]]],
+    board: Board,
+) -> tuple[Observations, list[Target], Interval | None]:
+    """Return the sightings of a carried board, its pose at rest, and the time of the rest.
+
+    Parameters
+    ----------
+    lenses, nominal : as for :func:`gather_carried`.
+    sightings : by camera, times in ns and the corners of the board in the frames at these times.
+    board : the board.
+
+    Raises
+    ------
+    IpsysError
+        A camera has no intrinsics.
+    """
+    missing = sorted(set(sightings) - set(lenses))
+    if missing:
+        raise IpsysError(
+            f"camera {missing[0]}: has no intrinsics; give --calibration, or --field-of-view for nominal ones"
+        )
+    rest = _longest_rest([[(t, seen.outline.mean(axis=0)) for t, seen in own] for own in sightings.values()])
+    epoch_ns = min((own[0][0] for own in sightings.values()), default=0)
+    points_m = board.points_m(np.arange(board.grid[0] * board.grid[1]))
+    parts = tuple(_board_table(own, rest, epoch_ns, len(points_m)) for own in sightings.values())
+    cameras = tuple(CameraPrior(name, lenses[name], name in nominal, None) for name in sightings)
+    points = () if rest is None else (CalibrationPoint(_REST, 0),)
+    targets = [] if rest is None else [Target(0, _REST, np.zeros(3), np.eye(3), _EXACT)]
+    return Observations(cameras, (Body(BOARD, points_m, 0.0),), points, parts), targets, rest
+
+
+def _board_table(
+    own: Sequence[tuple[int, BoardSighting]], rest: Interval | None, epoch_ns: int, count: int
+) -> Sightings:
+    pixels = np.full((len(own), count, 2), np.nan)
+    for row, (_, seen) in enumerate(own):
+        pixels[row, seen.ids] = seen.pixels
+    times_ns = np.array([time_ns for time_ns, _ in own], dtype=np.int64)
+    resting = np.zeros(len(own), dtype=np.bool_)
+    if rest is not None:
+        resting = (times_ns >= rest.start) & (times_ns <= rest.end)
+    return Sightings(
+        np.zeros(len(own), dtype=np.intp),
+        np.where(resting, 0, -1),
+        (times_ns - epoch_ns) / NS_PER_S,
+        pixels,
+        np.tile(_BOARD_CORNER_PX**2 * np.eye(2 * count), (len(own), 1, 1)),
+    )
+
+
 def _shape(rig: Rig, robot: str) -> BodyShape:
     shapes = {shape.robot: shape for shape in body_shapes(rig)}
     if robot not in shapes:
@@ -100,25 +165,31 @@ def _is_seen(measurement: Measurement, markers: Mapping[str, Sequence[Markers]])
 
 
 def _find_rest(shape: BodyShape, markers: Mapping[str, Sequence[Markers]]) -> Interval | None:
-    """Return the longest time in which a camera sees the body at rest; None if it is never at rest."""
+    return _longest_rest(
+        [
+            (message.timestamp, marker.corners_px.mean(axis=0))
+            for message in own
+            for marker in message.markers
+            if marker.id == marker_id
+        ]
+        for own in markers.values()
+        for marker_id in shape.markers
+    )
+
+
+def _longest_rest(tracks: Iterable[Sequence[tuple[int, Array]]]) -> Interval | None:
+    """Return the longest time in which a place in an image does not move; None without a rest."""
     best = None
-    for messages in markers.values():
-        for marker_id in shape.markers:
-            rows = [
-                (message.timestamp, marker.corners_px.mean(axis=0))
-                for message in messages
-                for marker in message.markers
-                if marker.id == marker_id
-            ]
-            start = 0
-            for row, (time_ns, centre_px) in enumerate(rows):
-                apart = np.linalg.norm(centre_px - rows[start][1]) > _STILL_PX
-                if apart or (row and time_ns - rows[row - 1][0] > _GAP_NS):
-                    start = row
-                    continue
-                length_ns = time_ns - rows[start][0]
-                if length_ns >= _STILL_NS and (best is None or length_ns > best.end - best.start):
-                    best = Interval(rows[start][0], time_ns)
+    for rows in tracks:
+        start = 0
+        for row, (time_ns, centre_px) in enumerate(rows):
+            apart = np.linalg.norm(centre_px - rows[start][1]) > _STILL_PX
+            if apart or (row and time_ns - rows[row - 1][0] > _GAP_NS):
+                start = row
+                continue
+            length_ns = time_ns - rows[start][0]
+            if length_ns >= _STILL_NS and (best is None or length_ns > best.end - best.start):
+                best = Interval(rows[start][0], time_ns)
     return None if best is None else Interval(best.start + _END_NS, best.end - _END_NS)
 
 
@@ -137,8 +208,7 @@ def _on_floor(point: CalibrationPoint, number: int) -> Target | None:
 
 
 def _on_body(pose: Array, number: int) -> Target:
-    sigmas = np.repeat([_ON_BODY_M, _ON_BODY_RAD], 3)
-    return Target(number, _REST, pose[:3, 3], pose[:3, :3] @ level_turns(np.zeros(1))[0], sigmas)
+    return Target(number, _REST, pose[:3, 3], pose[:3, :3] @ level_turns(np.zeros(1))[0], _EXACT)
 
 
 def _with_body(

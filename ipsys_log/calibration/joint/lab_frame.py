@@ -90,10 +90,13 @@ def find_frame(fit: JointFit, targets: Sequence[Target]) -> LabFrame:
     )
 
 
-_NO_FRAME = (
-    "fewer than two measured points are seen, and the body is never at rest; lay the body flat onto the "
-    "floor for 2 s where a camera sees it, or measure two points some metres apart"
-)
+_NO_FRAME = "the measured points are too near together; measure two points some metres apart"
+
+
+def first_camera(fit: JointFit) -> LabFrame:
+    """Return the coordinates of the first camera: those of the fit."""
+    none = np.zeros((_POSE, len(fit.covariance)))
+    return LabFrame(np.eye(3), np.zeros(3), none, np.zeros((_POSE, _POSE)), 0.0, 0, ("", 0.0))
 
 
 class _Pose:

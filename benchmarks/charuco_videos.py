@@ -4,10 +4,11 @@
     python benchmarks/charuco_videos.py --picture errors.png
 
 Four webcams saw one board. The frames of a synchronisation index are up to 10 ms apart by their stamps. The
-intrinsics are those of the reference. The simultaneous model has one pose of the board for each index. The
-timed model has a path of the board, the stamps of the frames, and a clock offset for each camera. A held-out
-error comes from a fit without those frames: half of the frames of one camera. The path comes from the other
-cameras, and the pose of the camera from its other half. The script writes JSON with -o.
+simultaneous model has one pose of the board for each index, and the intrinsics of the reference. The timed
+model is that of ``calibrate-lab --board``: a path of the board, the jitter of the stamps, and for each camera
+a clock offset, a row time and intrinsics. A held-out error comes from a fit without those frames: half of the
+frames of one camera. The path comes from the other cameras, and the pose of the camera from its other half.
+The script writes JSON with -o.
 """
 
 from __future__ import annotations
@@ -32,8 +33,8 @@ from ipsys_log.calibration.board import Board
 from ipsys_log.calibration.board_detection import LEAST_CORNERS, find_board
 from ipsys_log.calibration.images import find_sources
 from ipsys_log.calibration.joint.fit import JointFit
-from ipsys_log.calibration.joint.hand_held import fit_hand_held
-from ipsys_log.calibration.joint.held_out import predict_errors
+from ipsys_log.calibration.joint.hand_held import fit_hand_held, fit_motion
+from ipsys_log.calibration.joint.held_out import corner_sigma, distance_errors, predict_errors
 from ipsys_log.calibration.joint.observations import (
     Body,
     CalibrationPoint,
@@ -43,6 +44,7 @@ from ipsys_log.calibration.joint.observations import (
 )
 from ipsys_log.calibration.joint.settings import JointSettings
 from ipsys_log.messages import CameraCalibration
+from ipsys_log.tools.carried_lab import BOARD_SETTINGS
 from ipsys_log.vision.poses import make_pose
 
 __all__ = ["BoardVideos", "measure", "read_videos"]
@@ -90,8 +92,9 @@ class BoardVideos:
             covariances = np.tile(covariance, (len(own), 1, 1))
             parts.append(replace(own, point=numbers, covariances_px2=covariances).select(mask))
         points = () if timed else tuple(CalibrationPoint(str(n), 0) for n in used.tolist())
+        cameras = tuple(replace(own, row_time_s=None if timed else 0.0) for own in self.cameras)
         body = Body("board", _BOARD.points_m(np.arange(_CORNERS)), 0.0)
-        return Observations(self.cameras, (body,), points, tuple(parts))
+        return Observations(cameras, (body,), points, tuple(parts))
 
     @property
     def every(self) -> list[NDArray[np.bool_]]:
@@ -163,20 +166,29 @@ class _Model:
     timed: bool
     known: bool = False
 
-    def fit(self, videos: BoardVideos, sigma_px: float, masks: Sequence[NDArray[np.bool_]]) -> JointFit:
+    def fit(
+        self,
+        videos: BoardVideos,
+        sigma_px: float,
+        masks: Sequence[NDArray[np.bool_]],
+        settings: JointSettings = _SETTINGS,
+    ) -> JointFit:
         observations = videos.observe(self.timed, sigma_px, masks)
         poses = videos.reference if self.known else None
-        return fit_hand_held(observations, _SETTINGS, videos.step_s, camera_poses=poses)
+        # Half of the interval between frames: a path with fewer knots cannot follow a hand.
+        return fit_hand_held(observations, settings, videos.step_s / 2, camera_poses=poses)
 
     def fit_all(self, videos: BoardVideos) -> tuple[JointFit, float]:
         """Return the fit to all sightings, and the standard deviation of a corner in px that it gives."""
-        sigma_px = _FIRST_SIGMA_PX
-        for _ in range(2):
-            fit = self.fit(videos, sigma_px, videos.every)
-            sigma_px = _rms(_errors(fit)) / np.sqrt(2)
+        sigma_px, settings = _FIRST_SIGMA_PX, BOARD_SETTINGS if self.timed else _SETTINGS
+        for _ in range(3):
+            fit = self.fit(videos, sigma_px, videos.every, settings)
+            fit = fit_motion(fit) if self.timed else fit
+            settings = fit.settings
+            sigma_px = corner_sigma(fit) if self.timed else _rms(_errors(fit)) / np.sqrt(2)
         return fit, sigma_px
 
-    def hold_out(self, videos: BoardVideos, sigma_px: float) -> list[Array]:
+    def hold_out(self, videos: BoardVideos, sigma_px: float, settings: JointSettings) -> list[Array]:
         """Return the errors (n, 12, 2) of the frames of each camera that a fit does not use."""
         errors = []
         for camera, own in enumerate(videos.sightings):
@@ -185,7 +197,7 @@ class _Model:
             for out in (first, ~first):
                 masks = videos.every
                 masks[camera] = ~out
-                fit = self.fit(videos, sigma_px, masks)
+                fit = self.fit(videos, sigma_px, masks, settings)
                 held_out = videos.observe(self.timed, sigma_px, videos.every).sightings[camera].select(out)
                 parts.append(predict_errors(fit, camera, held_out))
             errors.append(np.concatenate(parts))
@@ -262,10 +274,11 @@ def _clocks(fit: JointFit) -> Figures:
     }
 
 
-def _agreement(model: _Model, videos: BoardVideos, sigma_px: float) -> Figures:
+def _agreement(model: _Model, videos: BoardVideos, sigma_px: float, settings: JointSettings) -> Figures:
     """Compare fits to the odd and to the even indices, by camera poses and clocks."""
     odd, even = (
-        model.fit(videos, sigma_px, [indices % 2 == side for indices in videos.indices]) for side in (1, 0)
+        model.fit(videos, sigma_px, [indices % 2 == side for indices in videos.indices], settings)
+        for side in (1, 0)
     )
     blocks = odd.problem.layout.cameras[1:]
     columns = np.concatenate([[*range(b.start, b.start + 6), *[b.edge + 1] * model.timed] for b in blocks])
@@ -300,10 +313,15 @@ def measure(videos: BoardVideos) -> Figures:
         if model.known:
             continue
         own["reference"] = _differences(_poses(fit), videos.reference)
-        own["held_out"] = _summary(model.hold_out(videos, sigma_px))
-        own["odd_even"] = _agreement(model, videos, sigma_px)
+        own["held_out"] = _summary(model.hold_out(videos, sigma_px, fit.settings))
+        own["odd_even"] = _agreement(model, videos, sigma_px, fit.settings)
         if model.timed:
             own |= _clocks(fit)
+            own["row_times_us"] = [
+                1e6 * float(fit.state.values[block.edge + 2]) for block in fit.problem.layout.cameras
+            ]
+            own["jitter_ms"] = _MS * fit.settings.stamp_jitter_s
+            own["square_errors_mm"] = (_MM * distance_errors(fit)).tolist()
     return figures
 
 
@@ -328,7 +346,10 @@ def _print(figures: Figures) -> None:
         print(f" at most {halves['largest_in_sigmas']:.1f}, {max(halves['position_mm']):.1f} mm")
     timed = figures["timed"]
     clocks = zip(figures["cameras"], timed["clocks_ms"], timed["clock_sigmas_ms"], strict=True)
-    print("\nclock offsets in ms:", ", ".join(f"{n} {c:.1f} +- {s:.1f}" for n, c, s in clocks))
+    rms_mm = float(np.sqrt(np.mean(np.square(timed["square_errors_mm"]))))
+    print(f"\nsquares at held-out instants: RMS error {rms_mm:.2f} mm; jitter {timed['jitter_ms']:.0f} ms")
+    print("row times in us:", ", ".join(f"{one:.1f}" for one in timed["row_times_us"]))
+    print("clock offsets in ms:", ", ".join(f"{n} {c:.1f} +- {s:.1f}" for n, c, s in clocks))
 
 
 def main() -> None:

@@ -31,7 +31,7 @@ from ipsys_log.vision.bodies import body_shapes
 _LAID_TILT_RAD = 0.001
 _CONTRADICTED = 4.0  # standard deviations
 # A board needs no intrinsics from a chessboard: it determines them.
-_BOARD_SETTINGS = JointSettings(
+BOARD_SETTINGS = JointSettings(
     focal_sigma=0.02, centre_sigma=0.01, distortion_sigma=0.05, edge_sigma_px=0.0, corner_floor_px=0.0,
     clock_sigma_s=0.2,
 )  # fmt: skip
@@ -134,7 +134,7 @@ def calibrate_with_board(
     if not sightings:
         raise IpsysError(f"{session}: no frame shows {board}; check --board, --dictionary and --inverted")
     observations, targets, rest = gather_board(lenses, _nominal(lenses), sightings, board)
-    fit = _fit(observations, _BOARD_SETTINGS, progress)
+    fit = _fit(observations, BOARD_SETTINGS, progress)
     for _ in range(_ROUNDS):
         size = 2 * observations.bodies[0].points_m.shape[0]
         covariance = corner_sigma(fit) ** 2 * np.eye(size)

@@ -9,18 +9,23 @@ from functools import partial
 import numpy as np
 
 from ipsys_log.messages import (
+    IMPORTED,
     CameraCalibration,
+    ChannelWritten,
     Distance,
     Interval,
     Marker,
     Markers,
     Measurement,
+    Message,
     ReferencePoint,
     Rig,
     RigBody,
     RigCamera,
     RigMarker,
+    Run,
 )
+from ipsys_log.messages.channels import MARKERS
 from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.bodies import body_shapes
 from ipsys_log.vision.lenses import project
@@ -33,6 +38,7 @@ CLOCKS_S = (0.0, 0.011, -0.007, 0.004)
 ROW_S = 25e-6
 # Somebody stands before all cameras, then the body lies on the floor.
 HIDDEN_S, REST_S = 1.5, 3.0
+START_NS = 1_700_000_000 * NS_PER_S
 BODY = "wand"
 FLOOR_ID = 20
 
@@ -152,7 +158,7 @@ def carry_wand(
                 if pixels is not None:
                     noisy = pixels + rng.normal(0, sigma_px, (4, 2))
                     seen.append(Marker(marker_id, noisy, max(sigma_px, 0.01) ** 2 * np.eye(8)))
-            stamp_ns = round((time_s - clock_s + rng.normal(0, jitter_s)) * NS_PER_S)
+            stamp_ns = START_NS + round((time_s - clock_s + rng.normal(0, jitter_s)) * NS_PER_S)
             frames.append(Markers(stamp_ns, tuple(seen), *SIZE_PX))
         markers[name] = frames
     measured = [_measure(point, flat_m, first_s, rng) for point, flat_m, _ in points]
@@ -197,8 +203,38 @@ def _measure(point: int, flat_m: Array, first_s: float, rng: np.random.Generator
         for name, at in (("A", np.zeros(2)), ("B", np.array([4.0, 0.0])))
     )
     start_s, end_s = first_s + 2 * point + 0.55, first_s + 2 * point + 1.45
-    still = Interval(round(start_s * NS_PER_S), round(end_s * NS_PER_S))
+    still = Interval(*(START_NS + round(one * NS_PER_S) for one in (start_s, end_s)))
     return Measurement(
         still.start, f"p{point}", marker_id=FLOOR_ID, distances=distances, side="left", height_m=0.0,
         still=still,
     )  # fmt: skip
+
+
+def wand_messages(wand: CarriedWand) -> list[Message]:
+    """Return the messages of a log with the markers as an imported run."""
+    frames = sorted(
+        (
+            _at(MARKERS.topic_of("tags", camera), frame, camera)
+            for camera, own in wand.markers.items()
+            for frame in own
+        ),
+        key=lambda message: message.log_time_ns,
+    )
+    frames = [replace(one, log_time_ns=one.log_time_ns + n) for n, one in enumerate(frames)]
+    last_ns = frames[-1].log_time_ns
+    outputs = tuple(
+        ChannelWritten(MARKERS.topic_of("tags", camera), len(own)) for camera, own in wand.markers.items()
+    )
+    run = Run(0, "tags", IMPORTED, {"format": "csv"}, outputs=outputs)
+    lenses = [
+        Message(f"/cameras/{camera}/calibration", 1, 1, one, camera) for camera, one in wand.lenses.items()
+    ]
+    measured = [Message("/measurements", last_ns + 1, one.timestamp, one) for one in wand.measurements]
+    return [
+        Message("/rig", 1, 1, wand.rig), *lenses, *frames, *measured,
+        Message("/runs/tags/record", last_ns + 2, last_ns, run),
+    ]  # fmt: skip
+
+
+def _at(topic: str, frame: Markers, camera: str) -> Message:
+    return Message(topic, frame.timestamp, frame.timestamp, frame, camera)

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
@@ -26,8 +27,13 @@ def test_frame_times_reduce_errors_on_real_images(data: Path, tmp_path: Path) ->
     assert figures["alone"]["in_sample"]["rmse_px"] < 0.2
     assert figures["reference"]["in_sample"]["rmse_px"] == pytest.approx(1.44, abs=0.1)
     assert figures["simultaneous"]["in_sample"]["rmse_px"] == pytest.approx(1.37, abs=0.1)
-    assert figures["timed"]["in_sample"]["rmse_px"] < 0.6
-    assert figures["timed"]["in_sample"]["median_px"] < 0.4
+    timed = figures["timed"]
+    # Higher than with a path that follows the errors of the stamps, 0.53 px, which held-out frames refute.
+    assert timed["in_sample"]["rmse_px"] < 0.9
+    assert timed["held_out"]["rmse_px"] < 1.5
+    assert np.sqrt(np.mean(np.square(timed["square_errors_mm"]))) < 0.5
+    # Four webcams of one type read 720 rows in about 1/33 s.
+    assert all(30 < row_us < 55 for row_us in timed["row_times_us"])
     for measure in ("rmse_px", "median_px"):
         simultaneous, timed = (figures[model]["held_out"][measure] for model in ("simultaneous", "timed"))
         assert timed < 0.7 * simultaneous

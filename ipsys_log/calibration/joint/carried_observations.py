@@ -224,10 +224,13 @@ def _with_body(
     bodies += [Body(str(marker_id), corners_m, 0.0) for marker_id, corners_m in shape.corners_m.items()]
     numbers = {marker_id: first + n for n, marker_id in enumerate(shape.corners_m)}
     epoch_ns = min(
-        message.timestamp + (marker.time_offset_ns or 0)
-        for own in markers.values()
-        for message in own
-        for marker in message.markers
+        (
+            message.timestamp + (marker.time_offset_ns or 0)
+            for own in markers.values()
+            for message in own
+            for marker in message.markers
+        ),
+        default=0,
     )
     sightings = []
     for own, messages in zip(stationary.sightings, markers.values(), strict=True):

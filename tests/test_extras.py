@@ -128,6 +128,8 @@ REFUSED = {
     "install 'ipsys_log[video]'",
     "import videos red=red.mp4 -o x.mcap": "red.mp4: a video needs PyAV: pip install 'ipsys_log[video]'",
     "import ros lab.bag -o x.mcap": "import of ROS bags needs rosbags: pip install 'ipsys_log[ros2]'",
+    "import --as detections lab.bag -o x.mcap --rig lab.toml": "import of ROS bags needs rosbags: pip "
+    "install 'ipsys_log[ros2]'",
     "setup new_lab": "setup needs Starlette and Uvicorn: pip install 'ipsys_log[web]'",
     "live --rerun --model-from model.mcap -o x.mcap": "--rerun needs Rerun: pip install 'ipsys_log[view]'",
     "report lab.mcap": "report needs Matplotlib and Jinja2: pip install 'ipsys_log[report]'",

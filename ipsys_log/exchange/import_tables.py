@@ -1,7 +1,6 @@
-"""Import of tables (CSV): calibration points, and detected markers as a run of a log."""
+"""Import of tables (CSV) and bags: calibration points, and detected markers as a run of a log."""
 
-from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,6 +15,7 @@ from ipsys_log.exchange.calibration_files import announce_assumed
 from ipsys_log.exchange.image_folders import parse_time
 from ipsys_log.exchange.lab_files import load_lenses
 from ipsys_log.exchange.row_files import NamedRow, read_named_rows
+from ipsys_log.extras import check_installed
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import (
     IMPORTED,
@@ -38,6 +38,7 @@ from ipsys_log.messages import (
 from ipsys_log.messages.channels import CAMERA_POINTS, MARKERS, RECORD, RIG, RUN_EVENTS
 from ipsys_log.messages.rig_file import check_name
 from ipsys_log.plain_text import shell_words
+from ipsys_log.stages.detect import sift_markers
 from ipsys_log.stages.detect.reports import LensInUse, Reports
 from ipsys_log.units import NS_PER_S
 
@@ -162,6 +163,8 @@ def _vector(row: NamedRow, names: tuple[str, ...]) -> tuple[float, float, float]
 _RUN = "imported"
 _CORNERS = tuple(f"{axis}{corner}_px" for corner in range(4) for axis in "xy")
 _NEEDED = ("time", "camera", "marker_id", *_CORNERS)
+_BAGS = (".bag", ".db3", ".mcap")
+_RECTIFIED = "camera {} has lens distortion; if the detector read rectified images, give P without distortion"
 _LATEST_NS = 1 << 62
 _LARGEST_ID = (1 << 31) - 1
 
@@ -171,7 +174,8 @@ class DetectionOptions:
     """The options of an import: a rig for a new log, intrinsics by camera, and the name of the run.
 
     ``rig_file`` is the path of the rig: the intrinsics of other cameras come from the files that it names.
-    ``assumed`` has a text for each camera whose file does not state the lens model.
+    ``assumed`` has a text for each camera whose file does not state the lens model; ``topics``, of a bag, the
+    topic of each camera.
     """
 
     rig: Rig | None = None
@@ -179,6 +183,7 @@ class DetectionOptions:
     run: str | None = None
     rig_file: Path | None = None
     assumed: Mapping[str, str] = field(default_factory=dict)
+    topics: Mapping[str, str] = field(default_factory=dict)
 
 
 class ImportedDetections(NamedTuple):
@@ -199,11 +204,10 @@ class ImportedDetections(NamedTuple):
 def import_detections(
     file: Path, into: Path | None, output: Path | None, options: DetectionOptions
 ) -> ImportedDetections:
-    """Write the detected markers of a table into a run of a log.
+    """Write the detected markers of a table, or of a bag with AprilTag detections, into a run of a log.
 
-    The columns are those of an exported table of markers: ``time``, ``camera``, ``marker_id`` and ``x0_px``
-    to ``y3_px``. Optional are ``log_time_ns``, ``time_offset_ns`` and ``edge_offset_px``. The intrinsics of a
-    camera give the size of its images.
+    A table has the columns of an exported table of markers (docs/export.md). The intrinsics of a camera give
+    the size of its images. Markers of a bag that are unknown or twice in a frame are left out and named.
 
     Parameters
     ----------
@@ -213,7 +217,7 @@ def import_detections(
     Raises
     ------
     IpsysError
-        The table is wrong, a camera has no intrinsics, there is no rig, or the log has images: the stages
+        The file is wrong, a camera has no intrinsics, there is no rig, or the log has images: the stages
         would detect the markers in these. Nothing is written then.
     """
     if into is None and output is None:
@@ -226,32 +230,41 @@ def import_detections(
                 f"without images: "
                 f"ipsys cut {shell_words(*session.paths)} -o part.mcap --exclude-topics '/cameras/*/image'"
             )
-        if options.rig is None and (session is None or not session.topics(RIG)):
+        rigs = [options.rig] if options.rig else session.payloads(session.topics(RIG)) if session else []
+        if not rigs:
             raise IpsysError(f"{session or file}: has no rig; add --rig FILE")
         known = _lenses(session, options.lenses)
-        frames = _read_frames(file)
+        is_bag = file.is_dir() or file.suffix.lower() in _BAGS
+        frames = (
+            _read_bag(file, options.topics, known, rigs[-1]) if is_bag else _read_table(file, options.topics)
+        )
         from_rig, assumed = _lenses_of_rig(options, {frame.camera: frame.where for frame in frames}, known)
         lenses, assumed = {**known, **from_rig}, {**options.assumed, **assumed}
         run = _run_name(session, options.run)
         messages = [_message(frame, lenses[frame.camera], run) for frame in frames]
-        messages = [*_reported(messages, lenses, run)]
+        messages = [*_reported(messages, lenses, run, rigs[-1] if is_bag else None)]
         texts = [message.payload.text for message in messages if isinstance(message.payload, Event)]
+        cameras = sorted({frame.camera for frame in frames})
+        texts += [_RECTIFIED.format(camera) for camera in cameras if is_bag and lenses[camera].D.any()]
         if session is None:
             messages = [*announce_assumed(_settings(options.rig, lenses, frames), assumed), *messages]
         last_ns = frames[-1].log_time_ns
         earlier = session.runs() if session is not None else []
         number = max((other.number for other in earlier), default=0) + 1
-        parameters = {"format": "csv", "file": file.name}
+        parameters = {"format": "ros" if is_bag else "csv", "file": file.name}
         record = Run(last_ns, run, IMPORTED, parameters, fingerprint(), number=number)
         _, target = stack.enter_context(open_target([into] if into is not None else [], output))
         append_run(target, record, last_ns, lambda: messages, {})
-    counts = Counter(dict.fromkeys(sorted({frame.camera for frame in frames}), 0))
-    for frame in frames:
-        counts[frame.camera] += len(frame.markers)
-    return ImportedDetections(output or target, run, dict(counts), from_rig, assumed, texts)
+    counts = dict.fromkeys(cameras, 0)
+    for message in messages:
+        if isinstance(message.payload, Markers):
+            counts[str(message.camera)] += len(message.payload.markers)
+    return ImportedDetections(output or target, run, counts, from_rig, assumed, [*dict.fromkeys(texts)])
 
 
-class _Frame(NamedTuple):
+class DetectedFrame(NamedTuple):
+    """The markers of a frame, sorted by id, and the place of the frame in errors."""
+
     log_time_ns: int
     time_ns: int
     camera: str
@@ -259,8 +272,17 @@ class _Frame(NamedTuple):
     where: str
 
 
-def _read_frames(file: Path) -> list[_Frame]:
+def _read_bag(file: Path, topics: Mapping[str, str], known: Collection[str], rig: Rig) -> list[DetectedFrame]:
+    check_installed("import of ROS bags needs", "rosbags")
+    from ipsys_log.exchange.ros_detections import read_bag_detections
+
+    return read_bag_detections(file, topics, {*known, *(camera.name for camera in rig.cameras)}, rig)
+
+
+def _read_table(file: Path, topics: Mapping[str, str]) -> list[DetectedFrame]:
     """Return the frames of a table in log order, with their markers sorted by id."""
+    if topics:
+        raise IpsysError("--camera: has no effect for a table; leave it out")
     by_frame: dict[tuple[int, int, str], dict[int, Marker]] = {}
     first_rows: dict[str, str] = {}
     for row in read_named_rows(file, _NEEDED):
@@ -278,7 +300,7 @@ def _read_frames(file: Path) -> list[_Frame]:
     if not by_frame:
         raise IpsysError(f"{file}: has no rows; export the markers again")
     return [
-        _Frame(*key, tuple(markers[one] for one in sorted(markers)), first_rows[key[2]])
+        DetectedFrame(*key, tuple(markers[one] for one in sorted(markers)), first_rows[key[2]])
         for key, markers in sorted(by_frame.items())
     ]
 
@@ -335,13 +357,16 @@ def _lenses_of_rig(
 
 
 def _reported(
-    messages: Sequence[Message], lenses: Mapping[str, CameraCalibration], run: str
+    messages: Sequence[Message], lenses: Mapping[str, CameraCalibration], run: str, rig: Rig | None
 ) -> Iterator[Message]:
-    """Yield frames, with an event before a frame whose markers contradict the intrinsics."""
+    """Yield frames after the events of their markers. With a rig, leave out unknown and ambiguous markers."""
     reports, topic = Reports(), RUN_EVENTS.topic_of(run)
     for message in messages:
-        used = LensInUse(lenses[str(message.camera)])
-        for payload in reports(message.camera, [used, message.payload]):
+        used, frame, events = LensInUse(lenses[str(message.camera)]), message.payload, list[Event]()
+        if rig is not None:
+            markers, events = sift_markers(frame.markers, rig, message)
+            frame = replace(frame, markers=markers)
+        for payload in reports(message.camera, [*events, used, frame]):
             at = topic if isinstance(payload, Event) else message.topic
             yield replace(message, topic=at, payload=payload)
 
@@ -357,7 +382,7 @@ def _run_name(session: Session | None, wanted: str | None) -> str:
 
 
 def _settings(
-    rig: Rig | None, lenses: Mapping[str, CameraCalibration], frames: Sequence[_Frame]
+    rig: Rig | None, lenses: Mapping[str, CameraCalibration], frames: Sequence[DetectedFrame]
 ) -> Iterator[Message]:
     """Yield the rig, and the intrinsics of the cameras with frames, just before the first frame."""
     cameras = sorted({frame.camera for frame in frames})
@@ -369,7 +394,7 @@ def _settings(
         yield Message(calibration_topic(camera), time_ns, time_ns, lens, camera)
 
 
-def _message(frame: _Frame, lens: CameraCalibration, run: str) -> Message:
+def _message(frame: DetectedFrame, lens: CameraCalibration, run: str) -> Message:
     markers = Markers(frame.time_ns, frame.markers, lens.width, lens.height)
     topic = MARKERS.topic_of(run, frame.camera)
     return Message(topic, frame.log_time_ns, frame.time_ns, markers, frame.camera)

@@ -96,7 +96,7 @@ def _name_cameras(path: Path, images: list[str], types: Mapping[str, type | None
                 )
         cameras |= topic_of
     if not cameras:
-        raise IpsysError(f"{path}: has no topics with images (sensor_msgs/Image or CompressedImage)")
+        raise IpsysError(f"{path}: has no topics with images; for AprilTag detections, add --as detections")
     return cameras
 
 

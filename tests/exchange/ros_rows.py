@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ import numpy as np
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 NS = 1_700_000_000_123_456_789
 STEP = 100_000_000
@@ -18,6 +18,8 @@ K = [500.5, 0, 320.25, 0, 510.125, 180, 0, 0, 1]
 D = [0.01, -0.02, 0.003, 1 / 3]
 Row = tuple[str, int, str, dict[str, Any]]
 Write = Callable[[Path, Sequence[Row]], Path]
+# Definitions of types that rosbags does not know, by name.
+Definitions = Mapping[str, str]
 
 
 def compressed(number: int, data: bytes, topic: str = "/red/image_raw/compressed", stamp: bool = True) -> Row:
@@ -44,8 +46,9 @@ def info(number: int, k: Sequence[float] = K, topic: str = "/red/camera_info") -
 def make(store: Any, kind: str, stamp_ns: int, values: dict[str, Any], is_ros1: bool) -> Any:
     types = store.types
     stamp = types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, 10**9))
-    head = types["std_msgs/msg/Header"](*([7] if is_ros1 else []), stamp, "optical")
-    fields = dict(values)
+    fields = {name: value(types) if callable(value) else value for name, value in values.items()}
+    frame_id = fields.pop("frame_id", "optical")
+    head = types["std_msgs/msg/Header"](*([7] if is_ros1 else []), stamp, frame_id)
     if kind.endswith("CameraInfo"):
         fields["roi"] = types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
         if is_ros1:
@@ -53,8 +56,17 @@ def make(store: Any, kind: str, stamp_ns: int, values: dict[str, Any], is_ros1: 
     return types[kind](header=head, **fields)
 
 
-def write_ros1(folder: Path, rows: Sequence[Row], start_ns: int = NS + 20_000_000) -> Path:
-    store, path = get_typestore(Stores.ROS1_NOETIC), folder / "drive.bag"
+def open_store(version: Stores, definitions: Definitions) -> Any:
+    store = get_typestore(version)
+    for name, text in definitions.items():
+        store.register(get_types_from_msg(text, name))
+    return store
+
+
+def write_ros1(
+    folder: Path, rows: Sequence[Row], start_ns: int = NS + 20_000_000, definitions: Definitions | None = None
+) -> Path:
+    store, path = open_store(Stores.ROS1_NOETIC, definitions or {}), folder / "drive.bag"
     with Writer1(path) as writer:
         known: dict[str, Any] = {}
         for number, (topic, stamp_ns, kind, values) in enumerate(rows):
@@ -65,8 +77,10 @@ def write_ros1(folder: Path, rows: Sequence[Row], start_ns: int = NS + 20_000_00
     return path
 
 
-def write_ros2(folder: Path, rows: Sequence[Row], plugin: StoragePlugin) -> Path:
-    store, path = get_typestore(Stores.ROS2_HUMBLE), folder / "drive"
+def write_ros2(
+    folder: Path, rows: Sequence[Row], plugin: StoragePlugin, definitions: Definitions | None = None
+) -> Path:
+    store, path = open_store(Stores.ROS2_HUMBLE, definitions or {}), folder / "drive"
     with Writer2(path, version=8, storage_plugin=plugin) as writer:
         known: dict[str, Any] = {}
         for number, (topic, stamp_ns, kind, values) in enumerate(rows):

@@ -18,6 +18,7 @@ from ipsys_log.extras import check_installed
 from ipsys_log.plain_text import shell_words
 
 _MCAP_MAGIC = b"\x89MCAP"
+_PROFILE = slice(21, 25)  # the place of "ros2" in the header of an MCAP file
 _LONGEST_HEADER = 10_000  # bytes
 _START = "2020-01-01T00:00:00Z"
 
@@ -50,8 +51,8 @@ _OPTIONS: dict[str, cli.Option] = {
     ),
     "camera": option(
         list[str] | None, "--camera", "NAME=TOPIC",
-        "Import the images of this ROS topic as the camera NAME; repeat it for each camera. Default: all "
-        "topics with images.",
+        "Import this ROS topic of images or detections as the camera NAME; repeat it for each camera. "
+        "Default: all such topics.",
     ),
     "robot": option(
         list[str] | None, "--robot", "NAME",
@@ -109,8 +110,8 @@ def import_(sources: list[Path], output: Path | None, kind: str | None, **option
     truth: tracks of another system, such as Vicon or OptiTrack, for scores. The command estimates the time
     offset and the rigid alignment to the tracks of a run. An alignment hides constant errors of the tracks.
 
-    detections: markers of another program, for all stages after the detection. The columns are those of
-    ipsys export --table markers.
+    detections: markers of another program, for all stages after the detection: a table with the columns of
+    ipsys export --table markers, or a ROS bag (also .mcap) with AprilTag detections.
 
     pairs: calibration points with their camera points, for fit, evaluate and plan. The columns are those of
     ipsys export --table pairs.
@@ -121,9 +122,10 @@ def import_(sources: list[Path], output: Path | None, kind: str | None, **option
         ipsys import red=red.mp4 white=white.mp4 -o lab.mcap
         ipsys import lab.bag -o lab.mcap                    # a ROS bag
         ipsys import vicon.csv --into monday.mcap           # ground truth
+        ipsys import --as detections drive.mcap -o lab.mcap --rig lab.toml
     """
     for source in sources if kind != "truth" else ():
-        _refuse_log(Path(str(source).rpartition("=")[2]))
+        _refuse_log(Path(str(source).rpartition("=")[2]), kind)
     kind = kind or _find_kind(sources[0])
     if kind == "ros" and options["into"] and not output:
         kind = "truth"  # a bag with images becomes a new log
@@ -279,19 +281,23 @@ def _import_detections(
     run: str | None,
     rig: Path | None,
     calibration: list[str] | None,
+    camera: list[str] | None,
 ) -> None:
     from ipsys_log.exchange.import_tables import DetectionOptions, import_detections
     from ipsys_log.messages.rig_file import load_rig
 
     lab = load_rig(rig) if rig else None
-    cameras = [camera.name for camera in lab.cameras] if lab else []
+    cameras = [rig_camera.name for rig_camera in lab.cameras] if lab else []
+    topics = _split_names(camera or [], "topic", "--camera red=/red/detections")
     assumed: dict[str, str] = {}
     lenses = load_calibrations(calibration, lambda: cameras, assumed.__setitem__)
-    imported = import_detections(source, into, output, DetectionOptions(lab, lenses, run, rig, assumed))
+    imported = import_detections(
+        source, into, output, DetectionOptions(lab, lenses, run, rig, assumed, topics)
+    )
     for name in sorted(imported.assumed.keys() - assumed.keys()):
         say_remark(name, imported.assumed[name])
     say_unusual(imported.lenses)
-    text = ", ".join(f"{count} of {camera}" for camera, count in imported.markers.items())
+    text = ", ".join(f"{count} of {name}" for name, count in imported.markers.items())
     console.print(f"run {imported.run}: markers: {text}")
     for line in imported.remarks:
         warn(line)
@@ -323,14 +329,14 @@ KINDS: dict[str, Callable[..., None]] = {
 }
 
 
-def _refuse_log(path: Path) -> None:
-    """Refuse a file that is a log already, by its first bytes."""
+def _refuse_log(path: Path, kind: str | None) -> None:
+    """Refuse a file that is a log already, by its first bytes; a bag of ROS 2 can have detections."""
     try:
         with path.open("rb") as file:
-            is_log = file.read(len(_MCAP_MAGIC)) == _MCAP_MAGIC
+            head = file.read(_PROFILE.stop)
     except OSError:
         return  # a folder, or no file: the importer reports it
-    if is_log:
+    if head.startswith(_MCAP_MAGIC) and not (kind == "detections" and head[_PROFILE] == b"ros2"):
         raise IpsysError(
             f"{path}: is already a log and needs no import. To list its contents: "
             f"ipsys info {shell_words(path)}; "

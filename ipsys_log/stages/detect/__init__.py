@@ -1,7 +1,7 @@
 """The stage *detect*: frames to markers, tracked and fitted at their edges, or as in the paper."""
 
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from typing import Any
@@ -132,7 +132,7 @@ class FrameDetector:
         except SizeError as error:
             yield self._other_size(message, str(error))
             return
-        markers, events = _sift(markers_in_frame, self._rig, message)
+        markers, events = sift_markers(markers_in_frame, self._rig, message)
         yield from events
         yield from self._new_lens(message)
         yield from self._squares(message, self._rig)
@@ -270,7 +270,9 @@ def _timed(marker: Marker, camera: RigCamera) -> Marker:
     return replace(marker, time_offset_ns=round(row * camera.row_time_ns))
 
 
-def _sift(found: list[Marker], rig: Rig, message: Message) -> tuple[tuple[Marker, ...], list[Event]]:
+def sift_markers(
+    found: Sequence[Marker], rig: Rig, message: Message
+) -> tuple[tuple[Marker, ...], list[Event]]:
     """Leave out ambiguous and unknown markers; return the other markers, and an event for each id."""
     counts = Counter(marker.id for marker in found)
     events = []

@@ -3,9 +3,9 @@
     python benchmarks/carried_labs.py                 # 16 labs
     python benchmarks/carried_labs.py --taped         # coordinates from six measured points
 
-Three cameras in corners of a room of 5 m see a box with five markers of 12 cm, which is carried for 20 s at 15
-frames a second. Corners have noise of 0.05 px, stamps a jitter, rows a rolling shutter; intrinsics are 0.1 %
-and 1 px wrong before the fit.
+Three cameras in corners of a room of 5 m see a box with five markers of 12 cm, which is carried for 20 s
+at 15 frames a second, out of step, with a rolling shutter. Corners have noise of 0.05 px, stamps a jitter;
+intrinsics are 0.1 % and 1 px wrong before the fit.
 """
 
 from __future__ import annotations
@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from tests.joint.carried_wand import CLOCKS_S, CarriedWand, carry_wand
-from tests.joint.test_carried_lab import calibrate, pose_errors
+from tests.joint.carried_wand import CLOCKS_S, CarriedWand, calibrate, carry_wand, pose_errors
 
 Array = NDArray[np.float64]
 

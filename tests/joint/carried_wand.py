@@ -8,6 +8,10 @@ from functools import partial
 
 import numpy as np
 
+from ipsys_log.calibration.joint.carried_observations import gather_carried
+from ipsys_log.calibration.joint.fit import JointFit
+from ipsys_log.calibration.joint.hand_held import fit_hand_held, fit_motion
+from ipsys_log.calibration.joint.lab_frame import LabFrame, apply_frame, find_frame
 from ipsys_log.messages import (
     IMPORTED,
     CameraCalibration,
@@ -30,7 +34,7 @@ from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.bodies import body_shapes
 from ipsys_log.vision.lenses import project
 from ipsys_log.vision.markers import marker_corners
-from ipsys_log.vision.poses import make_pose, rotation, transform
+from ipsys_log.vision.poses import make_pose, rotation, rotation_vector, transform
 from tests.joint.small_lab import Array
 
 SIZE_PX = (1920, 1080)
@@ -238,3 +242,26 @@ def wand_messages(wand: CarriedWand) -> list[Message]:
 
 def _at(topic: str, frame: Markers, camera: str) -> Message:
     return Message(topic, frame.timestamp, frame.timestamp, frame, camera)
+
+
+def calibrate(wand: CarriedWand) -> tuple[JointFit, LabFrame, JointFit]:
+    """Return the fit, the coordinates of the lab, and the fit in these coordinates."""
+    observations, targets, _ = gather_carried(
+        wand.rig, wand.lenses, (), wand.markers, BODY, wand.measurements
+    )
+    fit = fit_motion(fit_hand_held(observations))
+    frame = find_frame(fit, targets)
+    return fit, frame, apply_frame(fit, frame, 0.0, 0.0, np.zeros(3))
+
+
+def pose_errors(lab: JointFit, wand: CarriedWand) -> tuple[Array, Array]:
+    """Return errors (c, 6) of turns in rad and positions in m, and their NEES (c,)."""
+    errors, scores = [], []
+    for number, true in enumerate(wand.camera_from_world.values()):
+        block, turn = lab.problem.layout.cameras[number], lab.state.camera_turns[number]
+        origin_m = lab.state.values[block.start + 3 : block.start + 6]
+        error = np.r_[rotation_vector(turn @ true[:3, :3].T), origin_m + true[:3, :3].T @ true[:3, 3]]
+        covariance = lab.covariance[block.start : block.start + 6, block.start : block.start + 6]
+        errors.append(error)
+        scores.append(float(error @ np.linalg.solve(covariance, error)) / 6)
+    return np.array(errors), np.array(scores)

@@ -9,39 +9,14 @@ import pytest
 
 from ipsys_log.calibration.joint.carried_observations import gather_carried
 from ipsys_log.calibration.joint.fit import JointFit
-from ipsys_log.calibration.joint.hand_held import fit_hand_held, fit_motion
 from ipsys_log.calibration.joint.held_out import corner_sigma, hold_out_halves
-from ipsys_log.calibration.joint.lab_frame import LabFrame, apply_frame, find_frame
+from ipsys_log.calibration.joint.lab_frame import LabFrame
 from ipsys_log.calibration.joint.model import build_models
 from ipsys_log.errors import IpsysError
-from ipsys_log.vision.poses import rotation_vector
-from tests.joint.carried_wand import BODY, CLOCKS_S, ROW_S, CarriedWand, carry_wand
+from tests.joint.carried_wand import BODY, CLOCKS_S, ROW_S, CarriedWand, calibrate, carry_wand, pose_errors
 from tests.joint.small_lab import Array
 
 JITTER_S = 0.003
-
-
-def calibrate(wand: CarriedWand) -> tuple[JointFit, LabFrame, JointFit]:
-    """Return the fit, the coordinates of the lab, and the fit in these coordinates."""
-    observations, targets, _ = gather_carried(
-        wand.rig, wand.lenses, (), wand.markers, BODY, wand.measurements
-    )
-    fit = fit_motion(fit_hand_held(observations))
-    frame = find_frame(fit, targets)
-    return fit, frame, apply_frame(fit, frame, 0.0, 0.0, np.zeros(3))
-
-
-def pose_errors(lab: JointFit, wand: CarriedWand) -> tuple[Array, Array]:
-    """Return errors (c, 6) of turns in rad and positions in m, and their NEES (c,)."""
-    errors, scores = [], []
-    for number, true in enumerate(wand.camera_from_world.values()):
-        block, turn = lab.problem.layout.cameras[number], lab.state.camera_turns[number]
-        origin_m = lab.state.values[block.start + 3 : block.start + 6]
-        error = np.r_[rotation_vector(turn @ true[:3, :3].T), origin_m + true[:3, :3].T @ true[:3, 3]]
-        covariance = lab.covariance[block.start : block.start + 6, block.start : block.start + 6]
-        errors.append(error)
-        scores.append(float(error @ np.linalg.solve(covariance, error)) / 6)
-    return np.array(errors), np.array(scores)
 
 
 def in_sigmas(lab: JointFit, columns: list[int], truth: Array) -> Array:

@@ -8,26 +8,12 @@ other modules are private until 1.0. The command is ``ipsys``; the pipeline is i
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from ipsys_log.api.log_export import Export
+    from ipsys_log.api.opened_log import Listing, Log
     from ipsys_log.api.python_api import (
-        CalibrationResult,
-        Comparison,
-        Export,
-        Failure,
         FittedModel,
-        Listing,
-        LiveTracks,
-        Log,
-        LogCheck,
-        LogFinding,
         ModelEvaluation,
-        Outcome,
-        Player,
         ReplayResult,
-        SampledTrack,
-        Score,
-        ScoreComparison,
-        ScoreResult,
-        Tracker,
         calibrate,
         check,
         live,
@@ -38,8 +24,16 @@ if TYPE_CHECKING:
         score,
         verify,
     )
+    from ipsys_log.api.sampled_track import SampledTrack
+    from ipsys_log.calibration.calibrate import CalibrationResult, Failure
+    from ipsys_log.engine.provenance import Outcome
     from ipsys_log.errors import IpsysError
+    from ipsys_log.live_runs.player import LiveTracks, Player, Tracker
     from ipsys_log.models.locate_corners import FittedCornerModel
+    from ipsys_log.tools.differences import Comparison
+    from ipsys_log.tools.publish.scores import Score
+    from ipsys_log.tools.publish.scoring import ScoreComparison, ScoreResult
+    from ipsys_log.tools.soundness.finding import LogCheck, LogFinding
 
 __all__ = [
     "CalibrationResult",

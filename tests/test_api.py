@@ -43,12 +43,6 @@ def test_every_public_name_is_there() -> None:
         ipsys.nothing  # noqa: B018
 
 
-def test_package_has_the_names_of_the_api() -> None:
-    from ipsys_log.api import python_api as api
-
-    assert set(ipsys.__all__) == {*api.__all__, "FittedCornerModel", "IpsysError"}
-
-
 @pytest.fixture(scope="module")
 def api_objects(replayed: Path) -> dict[str, Any]:
     """Return an object of each public class, with as much content as a large lab gives it."""

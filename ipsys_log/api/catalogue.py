@@ -278,7 +278,11 @@ def update_catalogue(
         raise IpsysError(f"{folder}: has no file that ends in .mcap; name another folder")
     derived_of = _derived_logs([log for log, _ in logs.values()], derived)
     own = {path.resolve() for path in derived_of.values()}
-    logs = {name: row for name, row in logs.items() if _resolved(row[0]) not in own}
+    logs = {
+        name: (log, state)
+        for name, (log, state) in logs.items()
+        if not (isinstance(log, Path) and log.resolve() in own)
+    }
     rows: list[dict[str, Any]] = []
     read = 0
     for number, (name, (log, state)) in enumerate(logs.items()):
@@ -298,10 +302,6 @@ def _derived_logs(logs: Iterable[LogLocation], folder: Path | None) -> dict[LogL
     """Return the derived logs that exist, by their log."""
     derived = {log: derived_log_of(log, folder) for log in logs}
     return {log: path for log, path in derived.items() if path is not None and path.is_file()}
-
-
-def _resolved(log: LogLocation) -> Path | None:
-    return log.resolve() if isinstance(log, Path) else None
 
 
 def _earlier_rows(target: Path, mark: str) -> dict[str, dict[str, Any]]:

@@ -1,4 +1,7 @@
-"""The Python API of ``import ipsys_log as ipsys``. All other modules are private until 1.0."""
+"""The Python API of ``import ipsys_log as ipsys``. All other modules are private until 1.0.
+
+Names that are imported as themselves are public, too.
+"""
 
 from __future__ import annotations
 
@@ -12,15 +15,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ipsys_log.api.log_export import Export
-from ipsys_log.api.opened_log import Listing, Log, StrPath
-from ipsys_log.api.sampled_track import SampledTrack
+from ipsys_log.api.log_export import Export as Export
+from ipsys_log.api.opened_log import Listing as Listing
+from ipsys_log.api.opened_log import Log, StrPath
+from ipsys_log.api.sampled_track import SampledTrack as SampledTrack
 from ipsys_log.calibration.calibrate import CalibrationResult, Failure
 from ipsys_log.engine.output import choose_target
 from ipsys_log.engine.provenance import Outcome
 from ipsys_log.engine.request import Progress, Request
 from ipsys_log.errors import IpsysError
-from ipsys_log.live_runs.player import LiveTracks, Player, Tracker
+from ipsys_log.live_runs.player import LiveTracks as LiveTracks
+from ipsys_log.live_runs.player import Player, Tracker
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.known_contents import one_reading
 from ipsys_log.log.location import LogUrl, parse_location
@@ -31,10 +36,12 @@ from ipsys_log.models.table import AppliedModel, model_run, reads_corners
 from ipsys_log.plain_text import join_names
 from ipsys_log.statistics.accuracy import POOLED
 from ipsys_log.tools.differences import Comparison
-from ipsys_log.tools.publish.scores import Score
-from ipsys_log.tools.publish.scoring import ScoreComparison, ScoreResult
+from ipsys_log.tools.publish.scores import Score as Score
+from ipsys_log.tools.publish.scoring import ScoreComparison as ScoreComparison
+from ipsys_log.tools.publish.scoring import ScoreResult
 from ipsys_log.tools.soundness.check import check_logs
-from ipsys_log.tools.soundness.finding import LogCheck, LogFinding
+from ipsys_log.tools.soundness.finding import LogCheck
+from ipsys_log.tools.soundness.finding import LogFinding as LogFinding
 from ipsys_log.units import CM_PER_M
 
 if TYPE_CHECKING:
@@ -44,37 +51,6 @@ if TYPE_CHECKING:
     from ipsys_log.engine.pieces import PieceWorkers
     from ipsys_log.models.locate_corners import FittedCornerModel
     from ipsys_log.sinks.sink import Sink
-
-__all__ = [
-    "CalibrationResult",
-    "Comparison",
-    "Export",
-    "Failure",
-    "FittedModel",
-    "Listing",
-    "LiveTracks",
-    "Log",
-    "LogCheck",
-    "LogFinding",
-    "ModelEvaluation",
-    "Outcome",
-    "Player",
-    "ReplayResult",
-    "SampledTrack",
-    "Score",
-    "ScoreComparison",
-    "ScoreResult",
-    "Tracker",
-    "calibrate",
-    "check",
-    "live",
-    "load_model",
-    "open",
-    "play",
-    "replay",
-    "score",
-    "verify",
-]
 
 
 def open(*paths: StrPath | LogUrl) -> Log:

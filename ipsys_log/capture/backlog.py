@@ -1,11 +1,10 @@
 """Recorded frames that wait: for the stages, with those that are skipped, or for a measurement."""
 
-from __future__ import annotations
-
 import threading
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from typing import Self
 
 from ipsys_log.capture.recorder import Recording, Source, write_each
 from ipsys_log.errors import WriteError
@@ -145,7 +144,7 @@ class Backlog:
         self._changed = threading.Condition()
         self._thread = threading.Thread(target=self._record, name="recorder", daemon=True)
 
-    def __enter__(self) -> Backlog:
+    def __enter__(self) -> Self:
         self._thread.start()
         return self
 
@@ -238,7 +237,7 @@ class RecentFrames:
         self._limit_bytes, self._buffer_bytes = limit_bytes, 0
         self._buffer: deque[Message] = deque()
 
-    def __enter__(self) -> RecentFrames:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:

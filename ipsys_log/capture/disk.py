@@ -1,7 +1,5 @@
 """The disk of a recording: its remaining time, periodic sync, a full disk, and a file that is renamed."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import threading
@@ -9,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Self
 
 from ipsys_log.capture.frames import CameraState
 from ipsys_log.errors import LogError, WriteError, is_full
@@ -49,7 +48,7 @@ class Syncer:
         self._changed = threading.Condition()
         self._thread = threading.Thread(target=self._run, name="syncer", daemon=True)
 
-    def __enter__(self) -> Syncer:
+    def __enter__(self) -> Self:
         self._thread.start()
         return self
 

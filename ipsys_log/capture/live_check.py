@@ -6,14 +6,12 @@ marker are compared with other cameras in the overlap of their fields of view. T
 differ from place to place, so that only a sudden change of some centimetres is certain.
 """
 
-from __future__ import annotations
-
 import threading
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from math import hypot
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import cv2
 import numpy as np
@@ -309,7 +307,7 @@ class CameraMonitor:
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="monitor", daemon=True)
 
-    def __enter__(self) -> CameraMonitor:
+    def __enter__(self) -> Self:
         self._thread.start()
         return self
 

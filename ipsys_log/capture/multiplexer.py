@@ -4,8 +4,6 @@ Threads of the cameras only put the arriving frames into one queue. A message ge
 the queue.
 """
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import deque
@@ -90,7 +88,7 @@ class LiveCameras:
         }
         self.positions = PositionMonitor(clock.now_ns, self.states, say)
 
-    def __enter__(self) -> LiveCameras:
+    def __enter__(self) -> "LiveCameras":
         try:
             self._heartbeat.start()
             for thread in self._threads:
@@ -245,7 +243,7 @@ class LiveCameras:
         for saving in self._saving_of(arrival):
             saving.written = True
 
-    def _saving_of(self, arrival: Arrival) -> list[_Saving]:
+    def _saving_of(self, arrival: Arrival) -> "list[_Saving]":
         if not self._saving:
             return []
         with self._arrived:

@@ -20,8 +20,6 @@ Moon, P. Skelly, D. Towsley, Estimation and removal of clock skew from network d
 1999.
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from typing import NamedTuple
@@ -161,13 +159,13 @@ class _Limits(NamedTuple):
     most_ns: int
 
     @classmethod
-    def of(cls, exchange: Exchange) -> _Limits:
+    def of(cls, exchange: Exchange) -> "_Limits":
         """Return the limits by an exchange."""
         low_ns, high_ns = exchange.sent_ns - exchange.received_ns, exchange.back_ns - exchange.replied_ns
         room_ns = _drift_ns(exchange.replied_ns - exchange.received_ns)
         return cls(exchange.replied_ns, low_ns - room_ns, high_ns)
 
-    def combine(self, later: _Limits) -> _Limits:
+    def combine(self, later: "_Limits") -> "_Limits":
         """Return the limits at a later time; the least is above the most if the clock has jumped between."""
         room_ns = _drift_ns(later.node_ns - self.node_ns)
         least_ns, most_ns = self.least_ns - room_ns, self.most_ns + room_ns

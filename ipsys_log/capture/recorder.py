@@ -8,13 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Protocol
 
-from ipsys_log.capture.disk import (
-    Syncer,
-    describe_disk_failure,
-    describe_disk_fault,
-    describe_disk_full,
-    reserve,
-)
+from ipsys_log.capture import disk
 from ipsys_log.capture.frames import CameraState, Clock, Say
 from ipsys_log.engine.output import serialize, write_message
 from ipsys_log.errors import IpsysError, LogError, WriteError, is_full
@@ -94,7 +88,7 @@ class Recording:
         self.full: WriteError | None = None
         self.is_deleted = self.is_renamed = False
         self.path = Path(os.devnull) if writer is None else writer.path
-        self.syncer = Syncer(self._sync)
+        self.syncer = disk.Syncer(self._sync)
         self._writer, self._free = writer, free
         self._lock = threading.Lock()
         self._torn = False
@@ -159,9 +153,9 @@ class Recording:
         """
         self.check_file()
         if self.full is not None:
-            raise IpsysError(describe_disk_full(self.path, self.full)) from self.full
+            raise IpsysError(disk.describe_disk_full(self.path, self.full)) from self.full
         if (fault := self.syncer.fault) is not None:
-            raise IpsysError(describe_disk_failure(self.path, fault)) from fault
+            raise IpsysError(disk.describe_disk_failure(self.path, fault)) from fault
 
     def settle(self) -> bool:
         """Prevent further writes from all threads; return False if a thread is still writing."""
@@ -202,7 +196,7 @@ def write_each(
             if (fault := log.syncer.fault) is not None and not warned:
                 warned = True
                 source.add_event(
-                    "disk_fault", f"{describe_disk_fault(fault)}; the last written messages may be lost"
+                    "disk_fault", f"{disk.describe_disk_fault(fault)}; the last written messages may be lost"
                 )
             ticks = 0 if message is not None else ticks + 1
             if message is None:
@@ -220,7 +214,9 @@ def write_each(
                 continue
             if log.full is not None:
                 source.stop(
-                    "the disk is full" if is_full(log.full.cause) else describe_disk_fault(log.full.cause)
+                    "the disk is full"
+                    if is_full(log.full.cause)
+                    else disk.describe_disk_fault(log.full.cause)
                 )
             elif log.is_deleted:
                 source.stop(_DELETED)
@@ -253,7 +249,7 @@ def open_recording(
     created = _create(path, overwrite)
     try:
         with ExitStack() as resources:
-            log = Recording(resources.enter_context(created), resources.enter_context(reserve(path)))
+            log = Recording(resources.enter_context(created), resources.enter_context(disk.reserve(path)))
             try:
                 for message in settings:
                     log.put(message)
@@ -270,7 +266,7 @@ def open_recording(
                 )
                 raise IpsysError(text) from error
     except WriteError as error:
-        raise IpsysError(describe_disk_full(path, error)) from error
+        raise IpsysError(disk.describe_disk_full(path, error)) from error
 
 
 def _create(path: Path, overwrite: bool) -> LogWriter:

@@ -1,7 +1,5 @@
 """The simulated lab as live cameras: ``sim:red`` is its camera *red*, in real time."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -13,15 +11,8 @@ from urllib.parse import parse_qsl, urlencode
 
 from ipsys_log.calibration.board import Board, parse_board
 from ipsys_log.capture.frames import ActualSettings, Clock, Frame, Say, report_refused_settings, sleep_until
+from ipsys_log.capture.simulation import live_lab
 from ipsys_log.capture.simulation.cameras import Check, mount_cameras
-from ipsys_log.capture.simulation.live_lab import (
-    LIVE_SETTINGS,
-    Film,
-    board_cells,
-    board_film,
-    lab_film,
-    next_missing,
-)
 from ipsys_log.capture.simulation.render import exposure_interval
 from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.errors import IpsysError
@@ -49,9 +40,9 @@ class _Images:
     """The images of a film, rendered by a separate thread in the order of their use."""
 
     def __init__(
-        self, name: str, make_film: Callable[[Check], Film], timing: FrameTiming, clock: Clock
+        self, name: str, make_film: Callable[[Check], live_lab.Film], timing: "FrameTiming", clock: Clock
     ) -> None:
-        self._film: Film | None = None
+        self._film: live_lab.Film | None = None
         self._drawn: dict[int, bytes] = {}
         self._fault: BaseException | None = None
         self._make_film, self._timing, self._clock = make_film, timing, clock
@@ -72,7 +63,7 @@ class _Images:
         try:
             self._film = film = self._make_film(self._check)
             took_ns = 0
-            while (index := next_missing(film, self._drawn, self._frame_in(took_ns))) is not None:
+            while (index := live_lab.next_missing(film, self._drawn, self._frame_in(took_ns))) is not None:
                 self._check()
                 start_ns = self._clock.now_ns()
                 self._drawn[index] = film.draw(index)
@@ -121,10 +112,10 @@ def open_simulated(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterat
     say(f"camera {camera.name}: shows {shown}, {lab.width} x {lab.height} px, {lab.rate_hz:g} frames/s")
     timing = FrameTiming.of(lab, camera.stamp)
 
-    def make_film(check: Check) -> Film:
+    def make_film(check: Check) -> live_lab.Film:
         if simulated.board is None:
-            return lab_film(lab, simulated.number, check)
-        return board_film(lab, simulated.number, simulated.board, check)
+            return live_lab.lab_film(lab, simulated.number, check)
+        return live_lab.board_film(lab, simulated.number, simulated.board, check)
 
     images = _Images(camera.name, make_film, timing, clock)
     try:
@@ -173,7 +164,7 @@ def parse_source(camera: RigCamera) -> SimulatedCamera:
                 if setting_types[key] is not _parse_switch
                 else f"camera {camera.name}: {key}={text} is no switch; write {key}=true or {key}=false"
             ) from error
-    settings = replace(LIVE_SETTINGS, **values)  # type: ignore[arg-type]
+    settings = replace(live_lab.LIVE_SETTINGS, **values)  # type: ignore[arg-type]
     if name not in settings.cameras:
         names = ", ".join(f"sim:{other}" for other in settings.cameras)
         raise IpsysError(
@@ -189,7 +180,7 @@ def _parse_switch(text: str) -> bool:
 def _parse_board(camera: RigCamera, text: str) -> Board:
     try:
         board = parse_board(text, _SQUARE_M, _MARKER_SCALE, _DICTIONARY, False)
-        board_cells(board)
+        live_lab.board_cells(board)
     except IpsysError as error:
         raise IpsysError(f"camera {camera.name}: {str(error).replace('--board ', 'board=')}") from error
     return board
@@ -235,7 +226,7 @@ class FrameTiming(NamedTuple):
     behind_ns: int
 
     @classmethod
-    def of(cls, lab: LabSettings, stamp: str | None) -> FrameTiming:
+    def of(cls, lab: LabSettings, stamp: str | None) -> "FrameTiming":
         # A driver stamps the start of the first row's exposure, or the end of the last row's exposure.
         start_s, end_s = exposure_interval(0, lab.height - 1, lab)
         stamp_ns = round({"start": start_s, "end": end_s}.get(stamp or "", 0.0) * NS_PER_S)

@@ -1,7 +1,5 @@
 """Frames of a camera by Video for Linux, with the driver's stamps: its JPEG bytes, or encoded once."""
 
-from __future__ import annotations
-
 import errno
 import mmap
 import os
@@ -96,7 +94,7 @@ def _faults(label: str) -> Iterator[None]:
         raise SourceError(f"{label}: {message}") from error
 
 
-def _set_up(device: int, camera: RigCamera, label: str) -> tuple[ActualSettings, _ImageLayout | None]:
+def _set_up(device: int, camera: RigCamera, label: str) -> "tuple[ActualSettings, _ImageLayout | None]":
     """Set a camera to the settings of the rig; return its actual settings, and the layout of raw images."""
     offers = v4l2.list_formats(device)
     name = next((name for name in (*_JPEG, *_RAW_FORMATS) if name in offers), None)
@@ -197,7 +195,7 @@ class _Capture(NamedTuple):
     label: str
     device: int
     buffers: list[mmap.mmap]
-    layout: _ImageLayout | None
+    layout: "_ImageLayout | None"
 
 
 def _frames(capture: _Capture, clock: Clock, say: Say) -> Iterator[Frame | None]:

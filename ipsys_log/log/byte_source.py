@@ -13,7 +13,6 @@ from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
 
 from ipsys_log.errors import LogError, UnreadError
 from ipsys_log.log.location import LogLocation
@@ -143,48 +142,62 @@ class PartCounter:
 _MOST_PER_CALL = 1 << 30
 
 
-class LogBytes(Protocol):
+class LogBytes:
     """The bytes of a log at the time when it was opened, in a file or in a store.
 
     Attributes
     ----------
     size, bytes_read : bytes of the log, and bytes that its readers have asked for.
-    is_interrupted : True if an append was interrupted, so that these are the bytes before it.
+    is_interrupted : True if an append was interrupted, so that these are the bytes before it. A store
+        replaces an object as a whole.
     """
 
+    __slots__ = ()
+    path: LogLocation
+    size: int
     bytes_read: int
     read_limits: ReadLimits
 
     @property
-    def path(self) -> LogLocation: ...
-    @property
-    def size(self) -> int: ...
-    @property
-    def is_interrupted(self) -> bool: ...
+    def is_interrupted(self) -> bool:
+        return False
+
     def identity(self) -> tuple[object, object]:
         """Return what identifies the log, and what changes with its content."""
-        ...
+        raise NotImplementedError
 
     def read(self, offset: int, length: int) -> bytes:
         """Read exactly `length` bytes at `offset`; check the length before the allocation."""
-        ...
+        raise NotImplementedError
 
     def plan(self, name: str, ranges: Iterable[tuple[int, int]]) -> None:
-        """Announce ranges (start, end) that are going to be read, instead of those of the same name."""
-        ...
+        """Announce ranges (start, end) that are going to be read, instead of those of the same name.
+
+        A store needs this; in a file, the operating system reads ahead.
+        """
 
     def prefetch(self, offset: int, length: int) -> None:
-        """Begin to read bytes that are going to be read, without waiting for them."""
-        ...
+        """Begin to read bytes of a file that are going to be read, without waiting for them."""
 
-    def fault(self, offset: int, reason: str) -> LogError: ...
-    def refusal(self, reason: str) -> BoundError: ...
-    def check_number(self, number: int, item_name: str) -> None: ...
-    def close(self) -> None: ...
+    def fault(self, offset: int, reason: str) -> LogError:
+        """Return the error for damage at `offset`."""
+        raise NotImplementedError
+
+    def refusal(self, reason: str) -> BoundError:
+        """Return the error for a log that exceeds the limits. Such a log may be undamaged."""
+        raise NotImplementedError
+
+    def check_number(self, number: int, item_name: str) -> None:
+        """Refuse a log with more channels, runs or similar items than its size allows."""
+        if number > self.read_limits.max_channels:
+            raise self.refusal(f"it has {number} {item_name}, more than {self.read_limits.max_channels}")
+
+    def close(self) -> None:
+        """Release the file."""
 
 
 @dataclass(slots=True)
-class FileBytes:
+class FileBytes(LogBytes):
     """The bytes of a log file at the time when it was opened.
 
     Bytes from `tail_offset` on come from `tail_fd` (a journal). In the journal they begin at `tail_base`.
@@ -223,14 +236,9 @@ class FileBytes:
         return self.tail_fd >= 0
 
     def identity(self) -> tuple[object, object]:
-        """Return the identity of the file, and its size and change time."""
         return file_identity(self.fd)
 
-    def plan(self, name: str, ranges: Iterable[tuple[int, int]]) -> None:
-        """Do nothing: the operating system reads ahead."""
-
     def prefetch(self, offset: int, length: int) -> None:
-        """Ask the operating system to read bytes from the disk in advance, without waiting for them."""
         if hasattr(os, "posix_fadvise"):  # macOS lacks it
             with suppress(OSError):
                 os.posix_fadvise(self.fd, offset, length, os.POSIX_FADV_WILLNEED)
@@ -244,22 +252,15 @@ class FileBytes:
         return parts[0] if len(parts) == 1 else b"".join(parts)
 
     def fault(self, offset: int, reason: str) -> LogError:
-        """Return the error for damage at `offset`."""
         return LogError(
             f"{self.path} is damaged at byte {offset}: {reason}. Run: ipsys repair {shell_words(self.path)}"
         )
 
     def refusal(self, reason: str) -> BoundError:
-        """Return the error for a log that exceeds the limits. Such a log may be undamaged."""
         return BoundError(
             f"{self.path} is refused: {reason}. If it is a true recording, unpack it first: "
             f"mcap decompress {self.path} -o unpacked.mcap"
         )
-
-    def check_number(self, number: int, item_name: str) -> None:
-        """Refuse a log with more channels, runs or similar items than its file size allows."""
-        if number > self.read_limits.max_channels:
-            raise self.refusal(f"it has {number} {item_name}, more than {self.read_limits.max_channels}")
 
     def close(self) -> None:
         for fd in (self.fd, self.tail_fd):

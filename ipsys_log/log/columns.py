@@ -8,8 +8,6 @@ References
 https://protobuf.dev/programming-guides/encoding
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cache
@@ -153,7 +151,7 @@ class _Shape:
 
     def read(
         self, data: Bytes, numbers: NDArray[np.int64], kind: _Kind, fields: Sequence[str]
-    ) -> list[_Piece]:
+    ) -> "list[_Piece]":
         """Return the items of messages that fit, one piece for the n-th item of all messages."""
         pieces = []
         for item in range(self.items):

@@ -1,14 +1,12 @@
 """The table of contents of a log: schemas, channels, chunks, counts, and the parts of topics."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 from mcap import records as mcap
 
@@ -122,7 +120,7 @@ class Contents:
     data_crc: int = 0
     cut_short: bool = False
 
-    def copy(self) -> Contents:
+    def copy(self) -> Self:
         """Return a copy that does not change when these contents grow."""
         fields = ("schemas", "channels", "chunks", "attachments", "metadata", "counts", "unchunked")
         return replace(self, **{name: copy(getattr(self, name)) for name in fields})

@@ -4,16 +4,13 @@ Logs of this program name their cameras in their topics. In logs of other record
 images and calibrations, and the topic or the shared ``frame_id`` gives the name of the camera.
 """
 
-from __future__ import annotations
-
 import heapq
 import re
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import ExitStack
 from copy import copy
 from functools import cached_property
-from types import TracebackType
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,12 +80,10 @@ class Session:
             self._stack.close()
             raise
 
-    def __enter__(self) -> Session:
+    def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._stack.close()
 
     def __str__(self) -> str:
@@ -346,7 +341,7 @@ class Session:
         }
         return {reader: copies for reader, copies in parts.items() if copies}
 
-    def with_cameras(self, cameras: Collection[str]) -> Session:
+    def with_cameras(self, cameras: Collection[str]) -> Self:
         """Return a view of these logs with the channels of these cameras only; it ends with this session."""
         view = copy(self)
         view.images = {camera: topic for camera, topic in self.images.items() if camera in cameras}
@@ -401,7 +396,7 @@ class Session:
                     for channel in reader.channels.values()
                     if channel.schema is not None and payload_type(channel.schema.name) is payload
                 ]
-                reader.check_number(sum(counts), kind)
+                reader.view.check_number(sum(counts), kind)
 
     def _cameras(self, channel: Channel) -> dict[str, str]:
         """Return the topic by camera; if a camera has topics of several types, that of the first type."""

@@ -9,13 +9,14 @@ The CRC of an image is computed once. The hash of its channel, its chunk and the
 import hashlib
 import struct
 import zlib
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
 
 from mcap import records as mcap
 
 from ipsys_log.log.byte_source import LogBytes
-from ipsys_log.log.contents import Contents
+from ipsys_log.log.contents import Contents, RawMessage
 from ipsys_log.log.records import HEADER, parse, to_bytes, walk
 
 Buffer = bytes | memoryview
@@ -105,6 +106,14 @@ class ChannelHash:
         if self.valid:
             row = _ROW.pack(log_time_ns, publish_time_ns, length, crc)
             self.digest = hashlib.blake2b(self.digest + row, digest_size=16).digest()
+
+
+def hash_messages(messages: Iterable[RawMessage]) -> ChannelHash:
+    """Return the hash chain of messages in log order."""
+    state = ChannelHash()
+    for message in messages:
+        state.add(message.log_time_ns, message.publish_time_ns, message.data)
+    return state
 
 
 def metadata_of_hashes(hashes: dict[str, ChannelHash], offset: int) -> bytes:

@@ -24,7 +24,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import Protocol
 
 from ipsys_log.errors import LogError
 from ipsys_log.log.byte_source import FileBytes, open_for_reading
@@ -32,23 +31,10 @@ from ipsys_log.log.location import describe_broken_link
 from ipsys_log.log.records import MAGIC
 
 
-class Storage(Protocol):
-    """The operations that change files. Reads call ``os.pread`` directly."""
+class Storage:
+    """The operations that change files; only tests replace them. Reads call ``os.pread`` directly."""
 
-    def open(self, path: Path, flags: int) -> int: ...
-    def close(self, fd: int) -> None: ...
-    def pwrite(self, fd: int, data: bytes | memoryview, offset: int) -> int: ...
-    def truncate(self, fd: int, size: int) -> None: ...
-    def fsync(self, fd: int) -> None: ...
-    def rename(self, source: Path, target: Path) -> None: ...
-    def link(self, path: Path, second: Path) -> None: ...
-    def unlink(self, path: Path) -> None: ...
-    def fsync_directory(self, directory: Path) -> None: ...
-
-
-@dataclass(frozen=True, slots=True)
-class Disk:
-    """The real file system."""
+    __slots__ = ()
 
     def open(self, path: Path, flags: int) -> int:
         return os.open(path, flags | os.O_CLOEXEC, 0o666)
@@ -82,7 +68,7 @@ class Disk:
             os.close(fd)
 
 
-DISK: Storage = Disk()
+DISK = Storage()
 
 
 def write_all(storage: Storage, fd: int, data: bytes | memoryview, offset: int) -> None:

@@ -8,14 +8,8 @@ from pathlib import Path, PurePath, PurePosixPath
 from typing import Any
 
 from ipsys_log.errors import IpsysError, UnreadError
+from ipsys_log.log import remote_object
 from ipsys_log.log.location import LogLocation, LogState, LogUrl, parse_location
-from ipsys_log.log.remote_object import (
-    changed_ns_of,
-    check_protocol,
-    open_filesystem,
-    repeat_request,
-    version_of,
-)
 
 _ALL_BELOW = "**/*.mcap"
 _FLAT = ("s3", "s3a", "gs", "gcs")  # stores without folders, whose file systems list by a prefix
@@ -155,11 +149,8 @@ def logs_below(folder: Path) -> list[Path]:
     """
     if not folder.is_dir():
         raise IpsysError(f"{folder}: is not a folder; name a folder with logs")
-    return sorted(path for path in folder.rglob("*.mcap") if path.is_file() or _is_broken_link(path))
-
-
-def _is_broken_link(path: Path) -> bool:
-    return path.is_symlink() and not path.exists()
+    broken_links = (path for path in folder.rglob("*.mcap") if path.is_symlink() and not path.exists())
+    return sorted([*broken_links, *(path for path in folder.rglob("*.mcap") if path.is_file())])
 
 
 def states_below(folder: LogLocation) -> Iterator[tuple[str, LogLocation, LogState | None]]:
@@ -199,7 +190,7 @@ def _logs_of(location: LogLocation) -> Iterator[LogLocation]:
         if location.is_pattern or location.is_folder:
             yield from _list_objects(location if location.is_pattern else _all_below(location))
         else:
-            check_protocol(location)
+            remote_object.open_filesystem(location)  # its protocol is known, and its package installed
             yield location
         return
     if not location.is_dir():
@@ -234,9 +225,9 @@ def _list_states(pattern: LogUrl) -> dict[LogUrl, LogState | None]:
 
 
 def _list_entries(pattern: LogUrl) -> dict[LogUrl, Mapping[str, Any]]:
-    filesystem, path = open_filesystem(pattern)
+    filesystem, path = remote_object.open_filesystem(pattern)
     find = _find_flat if pattern.scheme in _FLAT else _find_by_folder
-    matches = repeat_request(pattern, lambda: find(filesystem, path))
+    matches = remote_object.repeat_request(pattern, lambda: find(filesystem, path))
     if not matches:
         raise UnreadError(f"{pattern}: no object matches; check the pattern and the permission to list")
     return {LogUrl(pattern.url, name): entry for name, entry in sorted(matches.items())}
@@ -267,4 +258,4 @@ def _state_of_entry(entry: Mapping[str, Any]) -> LogState | None:
     size = entry.get("size")
     if size is None:
         return None
-    return LogState(int(size), changed_ns_of(entry), "; ".join(version_of(entry)))
+    return LogState(int(size), remote_object.changed_ns_of(entry), "; ".join(remote_object.version_of(entry)))

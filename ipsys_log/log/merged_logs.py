@@ -206,11 +206,6 @@ def merge_messages(sources: Sequence[MergeSource], writer: LogWriter, advance: C
 _TIMESTAMP = "google.protobuf.Timestamp"
 
 
-def has_times(channel: StoredChannel) -> bool:
-    """Return whether this version knows the times within the messages of a channel."""
-    return channel.schema is not None and payload_type(channel.schema.name) is not None
-
-
 def check_shift(channel: StoredChannel) -> None:
     """Refuse a channel with times that cannot be shifted.
 
@@ -219,7 +214,8 @@ def check_shift(channel: StoredChannel) -> None:
     LogError
         The channel has known messages in another encoding than protobuf.
     """
-    if has_times(channel) and channel.message_encoding != "protobuf":
+    is_known = channel.schema is not None and payload_type(channel.schema.name) is not None
+    if is_known and channel.message_encoding != "protobuf":
         raise LogError(
             f"the times in the messages of {channel.topic} cannot be shifted, because their encoding is "
             f"{channel.message_encoding}; merge it as the first log"

@@ -14,17 +14,9 @@ import zstandard
 from mcap.opcode import Opcode
 
 from ipsys_log.errors import LogError, WriteError, disk_advice
+from ipsys_log.log import records
 from ipsys_log.log.hashing import WORTH_COMBINING, Buffer, combine, extend
 from ipsys_log.log.journal import Storage, replace_tail, roll_back, write_all
-from ipsys_log.log.records import (
-    CHUNK_HEAD_SIZE,
-    HEAD_SIZE,
-    INDEX_HEAD,
-    MESSAGE,
-    MESSAGE_HEAD_SIZE,
-    ChunkRef,
-    chunk_head,
-)
 from ipsys_log.plain_text import shell_words
 
 _ZSTD_LEVEL = 3
@@ -70,9 +62,9 @@ class ChunkBuilder:
     limits: ChunkLimits
     compress: bool
     _record: memoryview = field(default_factory=lambda: memoryview(bytearray(_FIRST_ROOM)))
-    _end: int = CHUNK_HEAD_SIZE
+    _end: int = records.CHUNK_HEAD_SIZE
     _crc: int = 0
-    _crc_end: int = CHUNK_HEAD_SIZE
+    _crc_end: int = records.CHUNK_HEAD_SIZE
     _start_ns: int = 0
     _end_ns: int = 0
     _entries: "dict[int, array[int]]" = field(default_factory=dict)
@@ -92,13 +84,13 @@ class ChunkBuilder:
         if entries is None:
             entries = self._entries[channel] = array("Q")
         entries.append(log_time_ns)
-        entries.append(position - CHUNK_HEAD_SIZE)
-        start = position + MESSAGE_HEAD_SIZE
+        entries.append(position - records.CHUNK_HEAD_SIZE)
+        start = position + records.MESSAGE_HEAD_SIZE
         end = start + len(data)
         if end > len(self._record):
             self._make_room(end)
-        length = end - position - HEAD_SIZE
-        MESSAGE.pack_into(
+        length = end - position - records.HEAD_SIZE
+        records.MESSAGE.pack_into(
             self._record, position, _OPCODE, length, channel, sequence, log_time_ns, publish_time_ns
         )
         self._record[start:end] = data
@@ -110,7 +102,7 @@ class ChunkBuilder:
     def is_full(self, now_ns: int) -> bool:
         """Return whether the chunk must be written before a message with log time `now_ns` is added."""
         return bool(self._entries) and (
-            self._end - CHUNK_HEAD_SIZE >= self.limits.size
+            self._end - records.CHUNK_HEAD_SIZE >= self.limits.size
             or now_ns - self._start_ns >= self.limits.span_ns
             or self._end_ns - now_ns >= self.limits.span_ns
         )
@@ -120,7 +112,7 @@ class ChunkBuilder:
         """The number of messages by channel id."""
         return {channel: len(entries) // 2 for channel, entries in self._entries.items()}
 
-    def build(self, offset: int) -> tuple[ChunkRef, Buffer, int] | None:
+    def build(self, offset: int) -> tuple[records.ChunkRef, Buffer, int] | None:
         """Return the chunk for `offset` with its message indexes, and the CRC-32 of these bytes.
 
         Return None if the chunk holds no message. The bytes are valid until the next message is added. Call
@@ -128,7 +120,7 @@ class ChunkBuilder:
         """
         if not self._entries:
             return None
-        data: Buffer = self._record[CHUNK_HEAD_SIZE : self._end]
+        data: Buffer = self._record[records.CHUNK_HEAD_SIZE : self._end]
         size = len(data)
         crc = data_crc = zlib.crc32(self._record[self._crc_end : self._end], self._crc)
         # A larger chunk holds one huge message. Readers refuse chunks that unpack to far more than the file
@@ -138,10 +130,10 @@ class ChunkBuilder:
         if compress:
             data = zstandard.ZstdCompressor(level=_ZSTD_LEVEL).compress(data)
             data_crc = zlib.crc32(data)
-        head = chunk_head(self._start_ns, self._end_ns, size, crc, name, len(data))
+        head = records.chunk_head(self._start_ns, self._end_ns, size, crc, name, len(data))
         length = len(head) + len(data)
         indexes, offsets = self._indexes(offset + length)
-        ref = ChunkRef(
+        ref = records.ChunkRef(
             offset, length, self._start_ns, self._end_ns, name, len(data), size, len(indexes), offsets
         )
         whole_crc = zlib.crc32(indexes, extend(zlib.crc32(head), data, data_crc))
@@ -163,8 +155,8 @@ class ChunkBuilder:
         offsets: dict[int, int] = {}
         for channel, entries in self._entries.items():
             rows = entries.tobytes()  # little-endian machines only, like the rest of this package
-            parts += (INDEX_HEAD.pack(Opcode.MESSAGE_INDEX, 6 + len(rows), channel, len(rows)), rows)
-            offsets[channel], offset = offset, offset + INDEX_HEAD.size + len(rows)
+            parts += (records.INDEX_HEAD.pack(Opcode.MESSAGE_INDEX, 6 + len(rows), channel, len(rows)), rows)
+            offsets[channel], offset = offset, offset + records.INDEX_HEAD.size + len(rows)
         return b"".join(parts), offsets
 
     def _make_room(self, end: int) -> None:
@@ -174,7 +166,7 @@ class ChunkBuilder:
 
     def clear(self) -> None:
         """Begin the next chunk."""
-        self._end = self._crc_end = CHUNK_HEAD_SIZE
+        self._end = self._crc_end = records.CHUNK_HEAD_SIZE
         self._crc, self._entries = 0, {}
 
 

@@ -10,21 +10,12 @@ from mcap import records as mcap
 from mcap.opcode import Opcode
 
 from ipsys_log.errors import LogError
+from ipsys_log.log import records
 from ipsys_log.log.byte_source import FileBytes
 from ipsys_log.log.chunks import ChunkContents, parse_chunk_contents, unpack
 from ipsys_log.log.codec import encode, schema_data
 from ipsys_log.log.contents import Contents, Schema
 from ipsys_log.log.hashing import METADATA_NAME
-from ipsys_log.log.records import (
-    HEADER,
-    MESSAGE,
-    ChunkRef,
-    RecordAt,
-    chunk_head,
-    index_records,
-    parse_chunk_head,
-    walk,
-)
 from ipsys_log.log.summary import add_record
 from ipsys_log.log.survey import Kind, Part, Survey
 from ipsys_log.log.writer import LogWriter
@@ -82,12 +73,12 @@ class PartCopier:
                 self._write_loose(part, part.start, part.end)
             elif part.kind == Kind.ATTACHMENT:
                 data = self.view.read(part.start, part.end - part.start)[:-4]
-                crc = zlib.crc32(data[HEADER.size :])
+                crc = zlib.crc32(data[records.HEADER.size :])
                 self._copy_index(Opcode.ATTACHMENT, part.start, part.end, [data, crc.to_bytes(4, "little")])
         self._mark()
 
     def _copy_records(self, part: Part) -> None:
-        for record in walk(self.view, part.start, part.end):
+        for record in records.walk(self.view, part.start, part.end):
             stop = record.offset + record.length
             if record.opcode == Opcode.MESSAGE:
                 self._write_loose(part, record.offset, stop)
@@ -102,7 +93,9 @@ class PartCopier:
         """Copy an attachment, or metadata of other programs: ours are hashes of the old log."""
         contents = Contents()
         try:
-            add_record(self.view, contents, ChunkContents(), {}, RecordAt(opcode, start, stop - start))
+            add_record(
+                self.view, contents, ChunkContents(), {}, records.RecordAt(opcode, start, stop - start)
+            )
         except LogError:  # its name is damaged: only the old log keeps it
             return
         if contents.attachments:
@@ -113,7 +106,7 @@ class PartCopier:
     def _copy_chunk(self, part: Part) -> None:
         """Copy a chunk as it is, with new message indexes; message by message if that is not possible."""
         view = self.view
-        head = parse_chunk_head(view, part.start)[1]
+        head = records.parse_chunk_head(view, part.start)[1]
         data = unpack(view, part.start, head, is_crc_checked=False)
         inside = parse_chunk_contents(view, part.start, data)
         span = inside.span_ns
@@ -125,17 +118,17 @@ class PartCopier:
         if not (part.is_proved and span and keeps_definitions and self.is_new):
             self._write_all(part, data, inside, None if head.compression else head.data_offset)
             return
-        record = chunk_head(*span, head.uncompressed_size, head.crc, head.compression, head.data_size)
+        record = records.chunk_head(*span, head.uncompressed_size, head.crc, head.compression, head.data_size)
         record += view.read(head.data_offset, head.data_size)
-        indexes, offsets = index_records(inside.entries, part.start + len(record))
-        ref = ChunkRef(
+        indexes, offsets = records.index_records(inside.entries, part.start + len(record))
+        ref = records.ChunkRef(
             part.start, len(record), *span, head.compression, head.data_size, head.uncompressed_size,
             len(indexes), offsets,
         )  # fmt: skip
         rows = []
         for offset, channel_id in inside.in_order():
-            _, length, _, _, time_ns, published_ns = MESSAGE.unpack_from(data, offset)
-            payload = memoryview(data)[offset + MESSAGE.size : offset + HEADER.size + length]
+            _, length, _, _, time_ns, published_ns = records.MESSAGE.unpack_from(data, offset)
+            payload = memoryview(data)[offset + records.MESSAGE.size : offset + records.HEADER.size + length]
             topic = self.writer.use(channel_id)
             rows.append((topic, time_ns, published_ns, len(payload), zlib.crc32(payload)))
             self._note(channel_id, time_ns)
@@ -147,7 +140,7 @@ class PartCopier:
         if at is None and self._is_lost(part, part.start, part.end):
             return
         for offset, channel_id in inside.in_order():
-            stop = offset + HEADER.size + HEADER.unpack_from(data, offset)[1]
+            stop = offset + records.HEADER.size + records.HEADER.unpack_from(data, offset)[1]
             span = None if at is None else (at + offset, at + stop)
             self._write(part, data[offset:stop], span, self._topic_in(part, inside, channel_id))
 
@@ -158,13 +151,13 @@ class PartCopier:
         self, part: Part, record: bytes, span: tuple[int, int] | None, topic: str | None = None
     ) -> None:
         """Write the message of a Message record, which lies in the bytes `span` of the file."""
-        _, _, channel_id, _, time_ns, published_ns = MESSAGE.unpack_from(record)
+        _, _, channel_id, _, time_ns, published_ns = records.MESSAGE.unpack_from(record)
         if span and self._is_lost(part, *span):
             return
         if topic is None:
             self._define(channel_id)
             topic = self.writer.use(channel_id)
-        self.writer.write(topic, time_ns, published_ns, record[MESSAGE.size :])
+        self.writer.write(topic, time_ns, published_ns, record[records.MESSAGE.size :])
         self._note(channel_id, time_ns)
         if not part.is_proved:
             self.unchecked += 1

@@ -31,7 +31,7 @@ from ipsys_log.log.chunk_messages import (
 from ipsys_log.log.chunks import has_wrong_crc
 from ipsys_log.log.contents import Contents, RawMessage, group_by_topic
 from ipsys_log.log.file_check import FileCheck, check_file
-from ipsys_log.log.hashing import ChannelHash, stored_hashes
+from ipsys_log.log.hashing import ChannelHash, hash_messages, stored_hashes
 from ipsys_log.log.journal import attach_journal, is_being_written
 from ipsys_log.log.known_contents import contents_of, open_remote
 from ipsys_log.log.location import LogLocation, LogUrl
@@ -136,10 +136,6 @@ class LogReader:
     def contents(self) -> Contents:
         """The table of contents of the log, which callers do not change."""
         return self._contents
-
-    def check_number(self, number: int, item_name: str) -> None:
-        """Refuse a log with more runs or measurements than its file size allows."""
-        self._view.check_number(number, item_name)
 
     @property
     def data_end(self) -> int:
@@ -277,10 +273,7 @@ class LogReader:
             )
         state = self._known_hash(topic)
         if state is None:
-            state = ChannelHash()
-            for message in self.messages([topic]):
-                state.add(message.log_time_ns, message.publish_time_ns, message.data)
-            self._hashes()[topic] = state
+            state = self._hashes()[topic] = hash_messages(self.messages([topic]))
         return state.digest.hex()
 
     def has_stored_hash(self, topic: str) -> bool:

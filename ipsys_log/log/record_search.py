@@ -15,22 +15,9 @@ from mcap import records as mcap
 from mcap.opcode import Opcode
 
 from ipsys_log.errors import LogError, UnreadError
+from ipsys_log.log import records
 from ipsys_log.log.byte_source import LARGEST_DEFINITION, BoundError, LogBytes
 from ipsys_log.log.chunks import check_definition, parse_chunk_contents, unpack
-from ipsys_log.log.records import (
-    ENTRY,
-    FOOTER,
-    HEADER,
-    INDEX_HEAD,
-    MAGIC,
-    MESSAGE,
-    RecordAt,
-    attachment_crcs,
-    parse_chunk_head,
-    parse_exact,
-    parse_message_index,
-    walk,
-)
 
 PRIVATE = 0x80  # every reader skips unknown types from this value on
 _BLOCK = 1 << 20
@@ -105,7 +92,7 @@ class RecordSearch:
                     return offset
         return None
 
-    def inner_record(self, record: RecordAt) -> int | None:
+    def inner_record(self, record: records.RecordAt) -> int | None:
         """Return the offset of the first of other records within this one, if its length is wrong.
 
         The length is right if a plausible record follows; soon after damage, this may be chance. Records
@@ -117,9 +104,9 @@ class RecordSearch:
         is_near = self.damage_end is not None and record.offset - self.damage_end < _NEAR_BYTES
         is_doubtful = is_near or not follows
         if is_doubtful and record.opcode == Opcode.ATTACHMENT:  # it may hold another log
-            stored, crc = attachment_crcs(self.view, record)
+            stored, crc = records.attachment_crcs(self.view, record)
             is_doubtful = stored != crc or stored == 0
-        inner = self.find(record.offset + HEADER.size, stop) if is_doubtful else None
+        inner = self.find(record.offset + records.HEADER.size, stop) if is_doubtful else None
         while inner is not None and inner != self.frame_at and not self.leads_to(inner, stop):
             if not follows and self._fits_at(inner):
                 break
@@ -132,17 +119,19 @@ class RecordSearch:
         while position < min(stop, start + _SECTOR_BYTES + 1):
             if not self._follows(position):
                 return False
-            position += HEADER.size + HEADER.unpack(self.view.read(position, HEADER.size))[1]
+            position += (
+                records.HEADER.size + records.HEADER.unpack(self.view.read(position, records.HEADER.size))[1]
+            )
         return self._follows(position)
 
     def _follows(self, stop: int) -> bool:
         """Return whether the log ends at `stop`, or the head of a plausible record is there."""
         view = self.view
-        if stop + HEADER.size > view.size:
+        if stop + records.HEADER.size > view.size:
             return stop == view.size
-        opcode, length = HEADER.unpack(view.read(stop, HEADER.size))
+        opcode, length = records.HEADER.unpack(view.read(stop, records.HEADER.size))
         is_known = opcode in IN_DATA or opcode >= PRIVATE
-        return is_known and int(length) <= view.size - stop - HEADER.size
+        return is_known and int(length) <= view.size - stop - records.HEADER.size
 
     def _proves_itself(self, offset: int) -> bool:
         budget = self.budget
@@ -170,9 +159,9 @@ class RecordSearch:
     def _is_record(self, offset: int) -> bool:
         """Return whether a whole record begins at `offset`, judged by its content and the next record."""
         view = self.view
-        record = next(walk(view, offset, view.size))
+        record = next(records.walk(view, offset, view.size))
         if record.opcode == Opcode.CHUNK:
-            head = parse_chunk_head(view, offset)[1]
+            head = records.parse_chunk_head(view, offset)[1]
             self.budget -= head.data_size
             data = unpack(view, offset, head, is_crc_checked=False) if self.budget >= 0 else b""
             return bool(parse_chunk_contents(view, offset, data).entries)
@@ -182,17 +171,17 @@ class RecordSearch:
             self.parse_definition(record)
             return True
         follows = self._follows(offset + record.length)
-        if record.opcode == Opcode.MESSAGE and record.length >= MESSAGE.size:
+        if record.opcode == Opcode.MESSAGE and record.length >= records.MESSAGE.size:
             return follows or self._fits_at(offset)
         if record.opcode == Opcode.ATTACHMENT:
-            stored, crc = attachment_crcs(view, record)
+            stored, crc = records.attachment_crcs(view, record)
             return stored == crc if stored else follows
         return follows and record.opcode == Opcode.MESSAGE_INDEX and bool(index_rows(view, record))
 
     def _fits_at(self, offset: int) -> bool:
-        head = self.view.read(offset, min(MESSAGE.size, self.view.size - offset))
-        is_message = len(head) == MESSAGE.size and head[0] == Opcode.MESSAGE
-        return is_message and self._fits(*MESSAGE.unpack(head)[2:])
+        head = self.view.read(offset, min(records.MESSAGE.size, self.view.size - offset))
+        is_message = len(head) == records.MESSAGE.size and head[0] == Opcode.MESSAGE
+        return is_message and self._fits(*records.MESSAGE.unpack(head)[2:])
 
     def _fits(self, channel: int, _: int, time_ns: int, published_ns: int) -> bool:
         """Return whether a message has a known channel, and about the time of the known messages.
@@ -205,7 +194,7 @@ class RecordSearch:
         is_near = self.span_ns[0] - _DAY_NS < time_ns < self.span_ns[1] + _DAY_NS
         return is_near and (is_consistent or channel in self.channels)
 
-    def parse_definition(self, record: RecordAt) -> mcap.Schema | mcap.Channel | None:
+    def parse_definition(self, record: records.RecordAt) -> mcap.Schema | mcap.Channel | None:
         """Parse a Schema or Channel record; check a Metadata record, too.
 
         Raises
@@ -219,7 +208,7 @@ class RecordSearch:
             if self._follows(record.offset + record.length):
                 check_definition(self.view, record)
             raise self.view.fault(record.offset, f"a definition claims {record.length} bytes")
-        parsed = parse_exact(self.view, record, self.view.read(record.offset, record.length))
+        parsed = records.parse_exact(self.view, record, self.view.read(record.offset, record.length))
         if isinstance(parsed, mcap.Schema) and parsed.id == 0:
             raise self.view.fault(record.offset, "a schema has the id 0")
         return parsed if isinstance(parsed, mcap.Schema | mcap.Channel) else None
@@ -228,14 +217,18 @@ class RecordSearch:
         """Return the end of the log whose summary begins at `start`; None if there is no such log."""
         view = self.view
         try:
-            for record in walk(view, start, view.size):
-                if record.opcode == Opcode.FOOTER and record.length == FOOTER.size:
-                    summary = FOOTER.unpack(view.read(record.offset, FOOTER.size))[2]
+            for record in records.walk(view, start, view.size):
+                if record.opcode == Opcode.FOOTER and record.length == records.FOOTER.size:
+                    summary = records.FOOTER.unpack(view.read(record.offset, records.FOOTER.size))[2]
                     stop = record.offset + record.length
-                    following = view.read(stop, min(2 * len(MAGIC), view.size - stop))
+                    following = view.read(stop, min(2 * len(records.MAGIC), view.size - stop))
                     # After a stray copy without summary, neither the file ends nor another log begins.
-                    is_mine = summary == start and following.startswith(MAGIC)
-                    return stop + len(MAGIC) if is_mine or following in (MAGIC, 2 * MAGIC) else None
+                    is_mine = summary == start and following.startswith(records.MAGIC)
+                    return (
+                        stop + len(records.MAGIC)
+                        if is_mine or following in (records.MAGIC, 2 * records.MAGIC)
+                        else None
+                    )
                 if record.opcode not in _IN_SUMMARY and record.opcode < PRIVATE:
                     return None
         except UnreadError:
@@ -257,7 +250,7 @@ class RecordSearch:
         seen: set[int] = set()
         end, is_right = start, True
         try:
-            for record in walk(self.view, start, self.view.size):
+            for record in records.walk(self.view, start, self.view.size):
                 if record.opcode != Opcode.MESSAGE_INDEX:
                     break
                 channel, rows = index_rows(self.view, record)
@@ -283,7 +276,7 @@ class RecordSearch:
         if not is_whole and claimed is not None:
             end = claimed
         pieces, position = [], 0
-        while position + HEADER.size <= len(data):
+        while position + records.HEADER.size <= len(data):
             stop = self._end_in(offset, data, position)
             if stop is None:
                 is_whole = False
@@ -302,7 +295,7 @@ class RecordSearch:
         """Return the end of the chunk with compressed data at `offset`, if its head is whole, else None."""
         head_at = offset - _HEAD_BEFORE_FRAME[self.view.read(offset, len(_ZSTD))]
         try:
-            record, head = parse_chunk_head(self.view, head_at)
+            record, head = records.parse_chunk_head(self.view, head_at)
         except LogError:
             return None
         stop = record.offset + record.length
@@ -310,15 +303,15 @@ class RecordSearch:
 
     def _end_in(self, offset: int, data: bytearray, position: int) -> int | None:
         """Return the end of the record at `position` in the data of the chunk at `offset`, if plausible."""
-        opcode, length = HEADER.unpack_from(data, position)
-        record = RecordAt(opcode, offset, HEADER.size + length)
+        opcode, length = records.HEADER.unpack_from(data, position)
+        record = records.RecordAt(opcode, offset, records.HEADER.size + length)
         stop = position + record.length
-        is_short = opcode == Opcode.MESSAGE and record.length < MESSAGE.size
+        is_short = opcode == Opcode.MESSAGE and record.length < records.MESSAGE.size
         if stop > len(data) or is_short or (opcode not in _IN_CHUNK and opcode < PRIVATE):
             return None
         if opcode in _DEFINITIONS:
             try:
-                parse_exact(self.view, record, bytes(data[position:stop]))
+                records.parse_exact(self.view, record, bytes(data[position:stop]))
             except LogError:
                 return None
         return stop
@@ -327,9 +320,9 @@ class RecordSearch:
         """Return the position of the next plausible message in the data of a chunk."""
         for match in _MESSAGE_HEAD.finditer(data, start):
             position = match.start()
-            if position + MESSAGE.size <= len(data):
-                _, length, *fields = MESSAGE.unpack_from(data, position)
-                is_inside = MESSAGE.size <= HEADER.size + length <= len(data) - position
+            if position + records.MESSAGE.size <= len(data):
+                _, length, *fields = records.MESSAGE.unpack_from(data, position)
+                is_inside = records.MESSAGE.size <= records.HEADER.size + length <= len(data) - position
                 if is_inside and self._fits(*fields):
                     return position
         return len(data)
@@ -364,12 +357,14 @@ def _decompress(view: LogBytes, offset: int, stop: int, most: int) -> tuple[byte
     return data, end, False
 
 
-def index_rows(view: LogBytes, record: RecordAt) -> tuple[int, list[tuple[int, int]]]:
+def index_rows(view: LogBytes, record: records.RecordAt) -> tuple[int, list[tuple[int, int]]]:
     """Return the channel of a MessageIndex record, and the log times and offsets of its messages."""
-    if record.length >= INDEX_HEAD.size:
-        _, length, channel, size = INDEX_HEAD.unpack(view.read(record.offset, INDEX_HEAD.size))
-        if length == size + 6 and size % ENTRY.size == 0:
+    if record.length >= records.INDEX_HEAD.size:
+        _, length, channel, size = records.INDEX_HEAD.unpack(
+            view.read(record.offset, records.INDEX_HEAD.size)
+        )
+        if length == size + 6 and size % records.ENTRY.size == 0:
             body = view.read(record.offset, record.length)
-            rows = parse_message_index(view, body, 0, channel, record.offset)
-            return channel, list(ENTRY.iter_unpack(rows))
+            rows = records.parse_message_index(view, body, 0, channel, record.offset)
+            return channel, list(records.ENTRY.iter_unpack(rows))
     raise view.fault(record.offset, "a MessageIndex record has another length than its entries")

@@ -4,8 +4,6 @@ A request takes as long as some hundred kilobytes. So ranges that the reader is 
 small gaps, and a sequence of reads without a plan is read ahead, twice as far each time.
 """
 
-from __future__ import annotations
-
 import threading
 from bisect import bisect_right
 from collections import OrderedDict
@@ -13,7 +11,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from ipsys_log.errors import LogError
-from ipsys_log.log.byte_source import BoundError, ReadLimits
+from ipsys_log.log.byte_source import BoundError, LogBytes, ReadLimits
 from ipsys_log.log.location import LogUrl
 from ipsys_log.log.remote_object import RemoteObject, open_object
 
@@ -136,38 +134,28 @@ class RemoteRanges:
 
 
 @dataclass(slots=True)
-class RemoteBytes:
-    """The bytes of a log in a store, at the version that was opened; the interface of `LogBytes`."""
+class RemoteBytes(LogBytes):
+    """The bytes of a log in a store, at the version that was opened."""
 
     path: LogUrl
     ranges: RemoteRanges
     bytes_read: int = 0
+    size: int = field(init=False)
     read_limits: ReadLimits = field(init=False)
 
     def __post_init__(self) -> None:
+        self.size = self.ranges.source.size
         self.read_limits = ReadLimits(self.size)
 
     @staticmethod
-    def open(url: LogUrl) -> RemoteBytes:
+    def open(url: LogUrl) -> "RemoteBytes":
         """Look an object up; nothing of it is read yet."""
         return RemoteBytes(url, RemoteRanges(open_object(url)))
 
-    @property
-    def size(self) -> int:
-        """The size of the object in bytes."""
-        return self.ranges.source.size
-
-    @property
-    def is_interrupted(self) -> bool:
-        """False: a store replaces an object as a whole."""
-        return False
-
     def identity(self) -> tuple[object, object]:
-        """Return the identity of the object, and that of its content."""
         return self.path, self.ranges.source.version
 
     def read(self, offset: int, length: int) -> bytes:
-        """Read exactly `length` bytes at `offset`; check the length before the request."""
         if offset < 0 or length < 0 or offset + length > self.size:
             excess = offset + length - self.size
             raise self.fault(offset, f"a record reaches {excess} bytes beyond the end of the file")
@@ -175,28 +163,14 @@ class RemoteBytes:
         return self.ranges.read(offset, length)
 
     def plan(self, name: str, ranges: Iterable[Range]) -> None:
-        """Announce ranges that are going to be read; they replace the plan of the same name."""
         self.ranges.plan(name, ranges)
 
-    def prefetch(self, offset: int, length: int) -> None:
-        """Do nothing: plans announce the ranges."""
-
     def fault(self, offset: int, reason: str) -> LogError:
-        """Return the error for damage at `offset`."""
         return LogError(
             f"{self.path} is damaged at byte {offset}: {reason}. Download it, and run: ipsys repair FILE"
         )
 
     def refusal(self, reason: str) -> BoundError:
-        """Return the error for a log that exceeds the limits."""
         return BoundError(
             f"{self.path} is refused: {reason}. If it is a true recording, download and unpack it"
         )
-
-    def check_number(self, number: int, item_name: str) -> None:
-        """Refuse a log with more channels, runs or similar items than its size allows."""
-        if number > self.read_limits.max_channels:
-            raise self.refusal(f"it has {number} {item_name}, more than {self.read_limits.max_channels}")
-
-    def close(self) -> None:
-        """Do nothing: the cache ends with its last reader."""

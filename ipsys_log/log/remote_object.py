@@ -57,24 +57,13 @@ class NoRangesError(ValueError):
     """A server that sends whole objects only."""
 
 
-def check_protocol(url: LogUrl) -> None:
-    """Check that the protocol of a URL is known, and its package installed; there is no request.
-
-    Raises
-    ------
-    UnreadError
-        The protocol is not known, or its package is missing.
-    """
-    open_filesystem(url)
-
-
 def open_filesystem(url: LogUrl) -> tuple[Any, str]:
     """Return the file system of fsspec for a URL, and the path in it; there is no request.
 
     Raises
     ------
     UnreadError
-        As :func:`check_protocol`.
+        The protocol is not known, or its package is missing.
     """
     check_installed(f"{url}: a log at a URL needs", "fsspec")
     from fsspec.core import url_to_fs

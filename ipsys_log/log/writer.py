@@ -7,7 +7,6 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 from mcap import records as mcap
@@ -169,10 +168,9 @@ class LogWriter:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if kind is None or self._finishes_on_error():
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        output = self._output
+        if kind is None or (isinstance(output, NewFile) and output.target is None):
             self.close()
         else:
             self.abandon()
@@ -228,8 +226,7 @@ class LogWriter:
             )
             self._output.emit(to_bytes(channel))
             self._contents.channels[channel.id] = channel
-        image = schema is not None and schema.name in IMAGE_SCHEMAS
-        self._channels[topic] = (channel.id, self._images if image else self._small)
+        self._select(topic, channel.id, schema)
         self._declared[topic] = schema, message_encoding
 
     def adopt_channel(self, channel: mcap.Channel, schema: mcap.Schema | None) -> int:
@@ -254,9 +251,7 @@ class LogWriter:
             same = mcap.Channel(key, channel.topic, channel.message_encoding, metadata, schema_id)
             self._output.emit(to_bytes(same))
             self._contents.channels[same.id] = same
-        image = own is not None and own.name in IMAGE_SCHEMAS
-        self._channels[channel.topic] = (same.id, self._images if image else self._small)
-        self._declared.pop(channel.topic, None)
+        self._select(channel.topic, same.id, own)
         return same.id
 
     def define(self, record: mcap.Schema | mcap.Channel) -> None:
@@ -286,11 +281,14 @@ class LogWriter:
     def use(self, channel_id: int) -> str:
         """Write the next messages of a topic to this one of its channels; return the topic."""
         channel = self._contents.channels[channel_id]
-        schema = self._schema_of(channel)
-        image = schema is not None and schema.name in IMAGE_SCHEMAS
-        self._channels[channel.topic] = (channel_id, self._images if image else self._small)
-        self._declared.pop(channel.topic, None)
+        self._select(channel.topic, channel_id, self._schema_of(channel))
         return channel.topic
+
+    def _select(self, topic: str, channel_id: int, schema: Schema | None) -> None:
+        """Write the next messages of a topic to a channel, in a chunk of images or of other messages."""
+        is_image = schema is not None and schema.name in IMAGE_SCHEMAS
+        self._channels[topic] = channel_id, self._images if is_image else self._small
+        self._declared.pop(topic, None)
 
     def copy_chunk(
         self,
@@ -417,9 +415,6 @@ class LogWriter:
         contents.data_end, contents.data_crc = output.offset, output.crc or 0
         output.finish(tail_bytes(contents))
         note_contents(output.fd, contents)
-
-    def _finishes_on_error(self) -> bool:
-        return isinstance(self._output, NewFile) and self._output.target is None
 
     def _check_open(self) -> None:
         if not self._open:

@@ -18,16 +18,9 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CameraCalibration, Message, Tracks
 from ipsys_log.messages.channels import MODEL, TRACKS
 from ipsys_log.sinks.selection import rig_in_force
+from ipsys_log.sinks.streams import ros2_messages
 from ipsys_log.sinks.streams import ros2_messages as ros2
 from ipsys_log.sinks.streams.poses import PoseSource
-from ipsys_log.sinks.streams.ros2_messages import (
-    CAMERA_INFO,
-    encode_camera_info,
-    encode_image,
-    is_stampable,
-    text_of,
-    type_hash,
-)
 from ipsys_log.statistics.floor_cameras import read_floor_cameras
 from ipsys_log.vision.poses import PosedCamera
 
@@ -125,7 +118,7 @@ class _Bag:
             if height_m is not None and (not self._robots or robot in self._robots)
         }
         cameras = _cameras(session, run)
-        if (known_m or cameras) and is_stampable(session.start_ns):
+        if (known_m or cameras) and ros2_messages.is_stampable(session.start_ns):
             data = ros2.encode_static(known_m, session.start_ns, cameras)
             self._put("/tf_static", ros2.TF, session.start_ns, session.start_ns, data, is_latched=True)
 
@@ -147,9 +140,9 @@ class _Bag:
 
     def _add_image(self, message: Message) -> None:
         camera, time_ns = str(message.camera), message.payload.timestamp
-        if not is_stampable(time_ns):
+        if not ros2_messages.is_stampable(time_ns):
             raise IpsysError(f"{message.topic}: a stamp of ROS 2 ends in 2038, but an image is later")
-        ros_type, data = encode_image(camera, message.payload)
+        ros_type, data = ros2_messages.encode_image(camera, message.payload)
         suffix = "/compressed" if "Compressed" in ros_type else ""
         self._put(f"/{camera}/image_raw{suffix}", ros_type, message.log_time_ns, time_ns, data)
         self.images += 1
@@ -158,8 +151,8 @@ class _Bag:
 
     def _add_lens(self, message: Message, time_ns: int) -> None:
         camera = str(message.camera)
-        data = encode_camera_info(camera, self._lenses[camera], time_ns)
-        self._put(f"/{camera}/camera_info", CAMERA_INFO, message.log_time_ns, time_ns, data)
+        data = ros2_messages.encode_camera_info(camera, self._lenses[camera], time_ns)
+        self._put(f"/{camera}/camera_info", ros2_messages.CAMERA_INFO, message.log_time_ns, time_ns, data)
 
     def _add_tracks(self, message: Message) -> None:
         assert isinstance(message.payload, Tracks)
@@ -177,12 +170,12 @@ class _Bag:
         self, topic: str, ros_type: str, log_ns: int, time_ns: int, data: bytes, is_latched: bool = False
     ) -> None:
         if ros_type not in self._schemas:
-            text = text_of(ros_type).encode()
+            text = ros2_messages.text_of(ros_type).encode()
             self._schemas[ros_type] = self._writer.register_schema(ros_type, "ros2msg", text)
         if topic not in self._channels:
             metadata = {
                 "offered_qos_profiles": _LATCHED if is_latched else "",
-                "topic_type_hash": type_hash(ros_type),
+                "topic_type_hash": ros2_messages.type_hash(ros_type),
             }
             schema = self._schemas[ros_type]
             self._channels[topic] = self._writer.register_channel(topic, "cdr", schema, metadata)

@@ -1,7 +1,5 @@
 """Sinks: consumers of messages, and the fan-out that hands messages to them. No sink delays a recording."""
 
-from __future__ import annotations
-
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -173,7 +171,7 @@ class FanOut:
         # Streams come first: each step before them delays the positions.
         self._outlets += functions
 
-    def __enter__(self) -> FanOut:
+    def __enter__(self) -> "FanOut":
         for worker in self._workers:
             worker.thread.start()
         return self

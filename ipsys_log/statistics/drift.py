@@ -202,10 +202,11 @@ def _fit(baseline: DriftBaseline, corners: Mapping[int, MeanCorners], markers: l
     points_c = np.concatenate([baseline.points_c[m] for m in markers])
     height_m = max(abs(float(baseline.camera.origin_m[2])), _LEAST_HEIGHT_M)
     units = np.array([1 / height_m] * 3 + [1.0] * 3)
-    before_px = _project(baseline.camera, points_c)
+    camera = baseline.camera
+    before_px = project_points(lens_model_of(camera.lens), _lens_parameters(camera), points_c)
     motion, scale_m = np.zeros(6), 1.0
     for _ in range(_STEPS):
-        predicted_px, slopes = _displace(baseline.camera, points_c, motion)
+        predicted_px, slopes = _displace(camera, points_c, motion)
         left = (moved_px - predicted_px + before_px).reshape(-1) + slopes @ motion
         rows, aims = np.linalg.solve(spread, slopes) * units, np.linalg.solve(spread, left)
         scale_m, evidence = _best_scale(rows, aims)
@@ -229,10 +230,6 @@ def _covariance(
         block = slice(8 * n, 8 * n + 8)
         covariance[block, block] += (own_px2 + model_px2) * np.eye(8) + 2 * _MARKER_PX**2 * shared
     return covariance
-
-
-def _project(camera: PosedCamera, points_c: Array) -> Array:
-    return project_points(lens_model_of(camera.lens), _lens_parameters(camera), points_c)
 
 
 def _lens_parameters(camera: PosedCamera) -> Array:

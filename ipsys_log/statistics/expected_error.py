@@ -6,8 +6,6 @@ The errors of all cameras are linear functions of the same independent normal nu
 more taped point on the whole floor follows from a small linear system, without a fit.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -46,14 +44,16 @@ class ExpectedErrors:
     camera : its name.
     seen : (b * a,), mask of the nodes of the grid at which the image contains a whole marker.
     errors_m : (n,), expected 2D errors at the n seen nodes, by the calibration alone.
-    model, view, length_m : the calibrated camera, the markers at these nodes, and their side.
+    model, size_px : the calibrated camera, and the width and height of its images.
+    view, length_m : the markers at these nodes, and their side.
     """
 
     camera: str
     seen: Mask
     errors_m: Array
     model: JointModel
-    view: VisibleMarkers
+    size_px: tuple[int, int]
+    view: "VisibleMarkers"
     length_m: float
 
     def modes_m(self, rows: slice = _ALL) -> Array:
@@ -97,28 +97,18 @@ def expect_errors(
     """
     expected = []
     for camera, model in models.items():
-        view = see_markers(model, sizes_px[camera], grid.nodes_m, height_m, length_m)
+        size_px = sizes_px[camera]
+        view = see_markers(model, size_px, grid.nodes_m, height_m, length_m)
         errors_m = np.zeros(len(view.corners_px))
         for first in range(0, len(errors_m), _AT_ONCE):
             rows = slice(first, first + _AT_ONCE)
             modes_m = _modes_at(model, view, length_m, rows)
             errors_m[rows] = mean_lengths(modes_m @ modes_m.swapaxes(1, 2))
-        expected.append(ExpectedErrors(camera, view.seen, errors_m, model, view, length_m))
+        expected.append(ExpectedErrors(camera, view.seen, errors_m, model, size_px, view, length_m))
     return expected
 
 
-def camera_modes(
-    model: JointModel, size_px: tuple[int, int], points_m: Array, heights_m: Array | float, length_m: float
-) -> tuple[Mask, Array]:
-    """Return a mask (p,) of the points (p, 2) at which a camera sees a whole marker, and their modes.
-
-    ``heights_m`` is a number or (p,).
-    """
-    view = see_markers(model, size_px, points_m, heights_m, length_m)
-    return view.seen, _modes_at(model, view, length_m, _ALL)
-
-
-def _modes_at(model: JointModel, view: VisibleMarkers, length_m: float, rows: slice) -> Array:
+def _modes_at(model: JointModel, view: "VisibleMarkers", length_m: float, rows: slice) -> Array:
     """Return the modes (r, 2, m) of some of the seen markers."""
     corners_px, heights_m = view.corners_px[rows], view.heights_m[rows]
     count = len(corners_px)
@@ -236,12 +226,9 @@ class TapedPoint:
 
 
 def choose_points(
-    models: Mapping[str, JointModel],
-    sizes_px: Mapping[str, tuple[int, int]],
     expected: Sequence[ExpectedErrors],
     candidates_m: Array,
     tape_m2: TapeCovariances,
-    length_m: float,
     goal_m: float,
     count: int,
     heights_m: Array | float = 0.0,
@@ -254,11 +241,9 @@ def choose_points(
 
     Parameters
     ----------
-    models, sizes_px : by camera.
     expected : of all cameras.
     candidates_m : (c, 2), possible points.
     tape_m2 : function for the covariances of their tape readings.
-    length_m : side of the marker.
     goal_m : wanted mean error.
     count : the largest number of points.
     heights_m : heights of the candidates above the floor, a number or (c,).
@@ -272,7 +257,7 @@ def choose_points(
     if not len(modes_m) or not len(candidates_m):
         return []
     heights_m = np.broadcast_to(heights_m, (len(candidates_m),))
-    candidates = _Candidates(models, sizes_px, candidates_m, heights_m, tape_m2(candidates_m), length_m)
+    candidates = _Candidates(expected, candidates_m, heights_m, tape_m2(candidates_m))
     chosen: list[TapedPoint] = []
     update = np.eye(modes_m.shape[2])
     mean_m = mean_error(modes_m)
@@ -323,20 +308,15 @@ class _Candidates:
     """Possible points for a taped marker, and the observations that they would give."""
 
     def __init__(
-        self,
-        models: Mapping[str, JointModel],
-        sizes_px: Mapping[str, tuple[int, int]],
-        points_m: Array,
-        heights_m: Array,
-        tapes_m2: Array,
-        length_m: float,
+        self, expected: Sequence[ExpectedErrors], points_m: Array, heights_m: Array, tapes_m2: Array
     ) -> None:
         self._seen, self._slopes = {}, {}
-        for camera, model in models.items():
-            seen, modes_m = camera_modes(model, sizes_px[camera], points_m, heights_m, length_m)
+        for one in expected:
+            view = see_markers(one.model, one.size_px, points_m, heights_m, one.length_m)
+            modes_m = _modes_at(one.model, view, one.length_m, _ALL)
             slopes = np.zeros((len(points_m), *modes_m.shape[1:]))
-            slopes[seen] = modes_m
-            self._seen[camera], self._slopes[camera] = seen, slopes
+            slopes[view.seen] = modes_m
+            self._seen[one.camera], self._slopes[one.camera] = view.seen, slopes
         self._tapes_m2 = tapes_m2
         self._free = np.any([*self._seen.values()], axis=0)
 

@@ -69,12 +69,9 @@ def expect_on_floor(
 
 
 def plan_joint_points(
-    models: Mapping[str, JointModel],
-    sizes_px: Mapping[str, tuple[int, int]],
     expected: Sequence[ExpectedErrors],
     candidates_m: Array,
     tape_m2: TapeCovariances,
-    length_m: float,
     count: int,
     progress: Progress = lambda done, total: None,
 ) -> MeasurementPlan:
@@ -82,11 +79,9 @@ def plan_joint_points(
 
     Parameters
     ----------
-    models, sizes_px : by camera.
     expected : from :func:`expect_on_floor`.
     candidates_m : (c, 3), possible positions of a marker.
     tape_m2 : function for the covariances of tape readings.
-    length_m : side of the marker.
     count : number of points.
     progress : called after each point.
 
@@ -96,9 +91,7 @@ def plan_joint_points(
         No camera sees a candidate.
     """
     flat_m, heights_m = candidates_m[:, :2], candidates_m[:, 2]
-    points = choose_points(
-        models, sizes_px, expected, flat_m, tape_m2, length_m, 0.0, count, heights_m, progress
-    )
+    points = choose_points(expected, flat_m, tape_m2, 0.0, count, heights_m, progress)
     if not points:
         raise IpsysError("no camera sees a whole marker at these heights on the floor; give another height")
     updates = [None, *(point.update for point in points)]
@@ -132,22 +125,15 @@ class PlannedDrive:
 
 
 def choose_drive(
-    models: Mapping[str, JointModel],
-    sizes_px: Mapping[str, tuple[int, int]],
-    expected: Sequence[ExpectedErrors],
-    low_m: Array,
-    high_m: Array,
-    height_m: float,
-    length_m: float,
+    expected: Sequence[ExpectedErrors], low_m: Array, high_m: Array, height_m: float
 ) -> PlannedDrive | None:
     """Choose the square of the floor in which a drive of 30 s reduces the mean expected error most.
 
     Parameters
     ----------
-    models, sizes_px : by camera.
     expected : expected errors of all cameras.
     low_m, high_m : (2,), corners of the floor.
-    height_m, length_m : height and side of the robot's marker.
+    height_m : height of the robot's marker.
 
     Returns
     -------
@@ -157,10 +143,10 @@ def choose_drive(
     grid = FloorGrid.of_cells(low_m, high_m, _STEP_M)
     if not len(modes_m) or not len(grid.nodes_m):
         return None
-    seen, rows = _information(models, sizes_px, grid.nodes_m, height_m, length_m)
+    seen, rows = _information(expected, grid.nodes_m, height_m)
     shape = len(grid.ys_m), len(grid.xs_m)
     places_m = grid.nodes_m.reshape(*shape, 2)
-    seen, rows = seen.reshape(len(models), *shape), rows.reshape(*shape, *rows.shape[1:])
+    seen, rows = seen.reshape(len(expected), *shape), rows.reshape(*shape, *rows.shape[1:])
     best: tuple[float, slice, slice] | None = None
     for y in range(0, max(1, shape[0] - _SQUARE + 1), _SQUARE // 2):
         for x in range(0, max(1, shape[1] - _SQUARE + 1), _SQUARE // 2):
@@ -174,7 +160,9 @@ def choose_drive(
         return None
     after_m, rows_y, rows_x = best
     inside_m, half_m = places_m[rows_y, rows_x].reshape(-1, 2), _STEP_M / 2
-    cameras = tuple(camera for camera, own in zip(models, seen[:, rows_y, rows_x], strict=True) if own.any())
+    cameras = tuple(
+        one.camera for one, own in zip(expected, seen[:, rows_y, rows_x], strict=True) if own.any()
+    )
     drive_m = inside_m.min(axis=0) - half_m, np.minimum(inside_m.max(axis=0) + half_m, high_m)
     return PlannedDrive(*drive_m, cameras, mean_error(modes_m), after_m)
 
@@ -208,11 +196,7 @@ def _update(rows: Array, seen: NDArray[np.bool_]) -> Array:
 
 
 def _information(
-    models: Mapping[str, JointModel],
-    sizes_px: Mapping[str, tuple[int, int]],
-    places_m: Array,
-    height_m: float,
-    length_m: float,
+    expected: Sequence[ExpectedErrors], places_m: Array, height_m: float
 ) -> tuple[NDArray[np.bool_], Array]:
     """Return a mask (c, p) of the cameras that see a robot at p places, and slopes (p, 8 c, m + 1).
 
@@ -220,16 +204,17 @@ def _information(
     that the place and the heading of the robot explain.
     """
     headings_rad = np.arange(len(places_m)) * _GOLDEN_RAD
-    count = next(iter(models.values())).modes.shape[1] + 1
-    seen = np.zeros((len(models), len(places_m)), dtype=np.bool_)
-    slopes = np.zeros((len(places_m), 8 * len(models), count))
-    by_pose = np.zeros((len(places_m), 8 * len(models), 3))
-    for number, (camera, model) in enumerate(models.items()):
-        view = see_markers(model, sizes_px[camera], places_m, height_m, length_m, headings_rad)
+    count = expected[0].model.modes.shape[1] + 1
+    seen = np.zeros((len(expected), len(places_m)), dtype=np.bool_)
+    slopes = np.zeros((len(places_m), 8 * len(expected), count))
+    by_pose = np.zeros((len(places_m), 8 * len(expected), 3))
+    for number, one in enumerate(expected):
+        view = see_markers(one.model, one.size_px, places_m, height_m, one.length_m, headings_rad)
         seen[number] = view.seen
         own = slice(8 * number, 8 * number + 8)
         if view.seen.any():
-            slopes[view.seen, own], by_pose[view.seen, own] = _whitened_slopes(model, *view[1:4], length_m)
+            whitened = _whitened_slopes(one.model, *view[1:4], one.length_m)
+            slopes[view.seen, own], by_pose[view.seen, own] = whitened
     visible = seen.any(axis=0)
     axes = np.linalg.qr(by_pose[visible])[0]
     slopes[visible] -= axes @ (axes.swapaxes(1, 2) @ slopes[visible])

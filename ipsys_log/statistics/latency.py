@@ -243,18 +243,13 @@ def step_times_s(entries: Iterable[Latency]) -> dict[str, NDArray[np.float64]]:
     ``received`` is the time from the exposure to the arrival of a frame: the latency of camera and cable. It
     is unknown for cameras without capture stamps.
     """
-    times_ns = np.array(
-        [[getattr(entry, _field(step)) for step in STEPS] for entry in entries], dtype=np.int64
-    )
-    times_ns = times_ns.reshape(-1, len(STEPS))
+    fields = ["timestamp" if step == "captured" else step for step in STEPS]
+    rows = [[getattr(entry, field) for field in fields] for entry in entries]
+    times_ns = np.array(rows, dtype=np.int64).reshape(-1, len(STEPS))
     took_s = np.diff(times_ns, axis=1) / NS_PER_S
     durations_s = {step: took_s[:, n] for n, step in enumerate(STEPS[1:])}
     durations_s["received"] = durations_s["received"][durations_s["received"] > 0]
     return {**durations_s, "total": (times_ns[:, -1] - times_ns[:, 1]) / NS_PER_S}
-
-
-def _field(step: str) -> str:
-    return "timestamp" if step == "captured" else step
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,8 +8,6 @@ squares explain them by the tilt of the floor, by one tilt of the top of each ro
 the image: scale, aspect, skew, centre and two radial terms.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -108,7 +106,7 @@ class MarkerSightings:
         self._begin()
         return True
 
-    def shapes(self, lens: CameraCalibration) -> SeenShapes | None:
+    def shapes(self, lens: CameraCalibration) -> "SeenShapes | None":
         """Return the shapes of the markers that the lens can see; None if there are too few."""
         if len(self) < _LEAST_LEVEL:
             return None
@@ -129,7 +127,7 @@ class SeenShapes(NamedTuple):
     @classmethod
     def of(
         cls, ids: Sequence[int], times_ns: Sequence[int], corners_px: Sequence[Array], lens: CameraCalibration
-    ) -> SeenShapes:
+    ) -> "SeenShapes":
         """Return the sightings that the lens can see."""
         corners = np.array(corners_px)
         uv = undistort(corners.reshape(-1, 2), lens).reshape(-1, 4, 2)

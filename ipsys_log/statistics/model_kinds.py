@@ -25,6 +25,7 @@ from ipsys_log.messages.stage import Progress, StageView, Step
 from ipsys_log.models.locate_points import LocatePoints
 from ipsys_log.models.rays import CalibrationPoints
 from ipsys_log.models.table import AppliedModel, min_pairs, reads_corners, reads_height
+from ipsys_log.statistics import camera_models
 from ipsys_log.statistics.accuracy import evaluate_cross_validated, evaluate_held_out
 from ipsys_log.statistics.calibration_points import (
     has_measurements,
@@ -32,13 +33,6 @@ from ipsys_log.statistics.calibration_points import (
     level_cameras,
     measured,
     training_pairs,
-)
-from ipsys_log.statistics.camera_models import (
-    check_different,
-    check_line,
-    check_pairs,
-    fit_camera_models,
-    fit_model,
 )
 from ipsys_log.statistics.cross_validation import (
     FOLDS,
@@ -149,7 +143,7 @@ def _without(model: Model, study: Study, names: set[str], notes: list[str]) -> t
         notes.append("gross outliers are not excluded: too few calibration points remain")
         return model, study
     try:
-        cameras = tuple(fit_camera_models(model.name, gather_points(fitted), fitted))
+        cameras = tuple(camera_models.fit_camera_models(model.name, gather_points(fitted), fitted))
     except FitError as error:
         notes.append(f"gross outliers are not excluded: {error}")
         return model, study
@@ -241,19 +235,19 @@ class PointModels:
                 f"but the log has {len(train_m)} in all; measure more"
                 + ("" if name == "rigid" else ", or use --model rigid")
             )
-        check_different(name, where, train_m)
-        check_line(where, train_m)
+        camera_models.check_different(name, where, train_m)
+        camera_models.check_line(where, train_m)
 
     def check_pairs(self, name: str, pairs: Mapping[str, Sequence[Pair]]) -> None:
         """Check that the observations of each camera are enough for a fit, if that is known before."""
-        check_pairs(name, pairs)
+        camera_models.check_pairs(name, pairs)
 
     def fit(
         self, name: str, view: StageView, train: Collection[str], notes: list[str], progress: Progress
     ) -> Model:
         """Fit a model of a log to the calibration points ``train``; add remarks to ``notes``."""
         pairs = training_pairs(view, train)
-        fitted = fit_model(name, pairs, view.last_ns(*self.fit_reads), progress)
+        fitted = camera_models.fit_model(name, pairs, view.last_ns(*self.fit_reads), progress)
         notes.extend(_unused_points(pairs, train))
         notes.extend(
             f"camera {camera}: all calibration points have the height {height_m * CM_PER_M:.1f} cm: the "

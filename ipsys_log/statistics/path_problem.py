@@ -8,25 +8,9 @@ import numpy as np
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Array
+from ipsys_log.statistics import path_cleaning, path_fit
 from ipsys_log.statistics.ground_truth import TrackedPath, last_poses
-from ipsys_log.statistics.path_cleaning import clean_trajectory, even_stamps, vertical_axis
 from ipsys_log.statistics.path_drift import ROUNDS, DriftFit, fit_drifting
-from ipsys_log.statistics.path_fit import (
-    LEAST_INSTANTS,
-    SCAN_S,
-    Freedom,
-    PathFit,
-    State,
-    fit_paths,
-    fit_white,
-)
-from ipsys_log.statistics.path_headings import (
-    LARGEST_TURN_MISFIT,
-    body_turn,
-    turn_misfit,
-    turn_pairs,
-    use_right_headings,
-)
 from ipsys_log.statistics.path_pairs import (
     Body,
     PathPair,
@@ -87,7 +71,7 @@ class _Candidate(NamedTuple):
 class ChosenFit(NamedTuple):
     """The fit as a measured path, and that as a dead-reckoned one if this is more likely."""
 
-    measured: PathFit
+    measured: path_fit.PathFit
     drifting: DriftFit | None
 
 
@@ -97,8 +81,8 @@ class Problem:
     def __init__(self, pairs: Sequence[TrajectoryPair], known: KnownParts, where: str) -> None:
         self.pairs, self.known, self.where = pairs, known, where
         self.remarks: list[str] = []
-        self.others = [even_stamps(pair.other) for pair in pairs]
-        self.cleaned = [clean_trajectory(one) for one in self.others]
+        self.others = [path_cleaning.even_stamps(pair.other) for pair in pairs]
+        self.cleaned = [path_cleaning.clean_trajectory(one) for one in self.others]
         self.other_ns = min(int(one.times_ns[0]) for one in self.cleaned)
         self.track_ns = min(int(pair.track.positions.times_ns[0]) for pair in pairs)
         self.upright, self.axes = self._upright()
@@ -118,7 +102,7 @@ class Problem:
         """Return whether the mirrored path fits the tracks much better, at any coarse offset."""
         for offset_s in self._coarse_s()[:3]:
             other_m, track_m = self._common(offset_s, np.zeros((len(self.bodies), 3)))
-            if len(other_m) < LEAST_INSTANTS:
+            if len(other_m) < path_fit.LEAST_INSTANTS:
                 continue
             medians_m = [_turned_misfit_m(other_m[:, :2] * [1, sign], track_m[:, :2]) for sign in (1.0, -1.0)]
             if medians_m[1] < min(medians_m[0] / _MIRRORED, _LARGEST_SHARE / 2 * extent_m(track_m)):
@@ -128,7 +112,7 @@ class Problem:
     def _upright(self) -> tuple[Array, str]:
         """Return the rotation (3, 3) that makes z the vertical axis, and a text about it."""
         is_free = self.known.align != "none"
-        if is_free and vertical_axis([one.points_m for one in self.cleaned]) == 1:
+        if is_free and path_cleaning.vertical_axis([one.points_m for one in self.cleaned]) == 1:
             return np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]]), "y up"
         return np.eye(3), ""
 
@@ -163,7 +147,7 @@ class Problem:
         """Leave out headings that are not of the same body; see :func:`use_right_headings`."""
         if self.has_headings:
             offsets_s = self._coarse_s()[:1]
-            self.bodies, remarks = use_right_headings(self.bodies, offsets_s, self.where)
+            self.bodies, remarks = path_cleaning.use_right_headings(self.bodies, offsets_s, self.where)
             self.remarks += remarks
 
     def _given(self) -> list[float]:
@@ -177,20 +161,20 @@ class Problem:
         return search_speeds([PathPair(b.other_s, b.other_m, b.track_s, b.track_m) for b in self.bodies])
 
     def _by_turn(self) -> list[tuple[float, float]]:
-        return search_turns(turn_pairs(self.bodies)) if self.has_headings else []
+        return search_turns(path_cleaning.turn_pairs(self.bodies)) if self.has_headings else []
 
     def agreement(self) -> float:
         """Return the correlation of the turn rates of both systems, or else of their speeds."""
         return next((correlation for _, correlation in self._by_turn() or self._by_speed()), 0.0)
 
-    def freedom(self) -> Freedom:
+    def freedom(self) -> path_fit.Freedom:
         turns, shifts, compared = ALIGNMENTS[self.known.align]
         has_axes = all(np.isfinite(body.axes).any() for body in self.bodies)
         has_headings = all(np.isfinite(body.heading_rad).any() for body in self.bodies)
         length_s = max(float(body.track_s[-1] - body.track_s[0]) for body in self.bodies)
         pivots = (0, 1) if self.known.pivot_m is None and (has_axes or has_headings) else ()
         is_free = self.known.offset_ns is None
-        return Freedom(
+        return path_fit.Freedom(
             turns,
             shifts,
             compared,
@@ -202,12 +186,12 @@ class Problem:
             uses_other_axes=has_axes,
         )
 
-    def start(self, offset_s: float, pivots_m: Array | None = None) -> State | None:
+    def start(self, offset_s: float, pivots_m: Array | None = None) -> path_fit.State | None:
         """Return the best rotation and translation at an offset; None without common instants."""
         if pivots_m is None:
             pivots_m = np.tile(self.known.pivot_m or (0.0, 0.0, 0.0), (len(self.bodies), 1))
         other_m, track_m = self._common(offset_s, pivots_m)
-        if len(other_m) < LEAST_INSTANTS:
+        if len(other_m) < path_fit.LEAST_INSTANTS:
             return None
         turns, _, compared = ALIGNMENTS[self.known.align]
         origin_m, centre_m = np.median(other_m, axis=0), np.median(track_m, axis=0)
@@ -218,10 +202,10 @@ class Problem:
             origin_m[axes], centre_m[axes] = other_m[:, axes].mean(axis=0), track_m[:, axes].mean(axis=0)
         else:
             centre_m = origin_m
-        body_turns = [body_turn(body, offset_s, rotation) for body in self.bodies]
+        body_turns = [path_cleaning.body_turn(body, offset_s, rotation) for body in self.bodies]
         middle_s = float(np.median(np.concatenate([body.track_s for body in self.bodies])))
         log_scale = float(np.log(scale)) if self.known.with_scale else 0.0
-        return State(
+        return path_fit.State(
             offset_s, 0.0, middle_s, rotation, origin_m, centre_m, log_scale, pivots_m, np.array(body_turns)
         )
 
@@ -250,7 +234,7 @@ class Problem:
         misfits_m = []
         for offset_s in offsets_s:
             other_m, track_m = self._common(offset_s, np.zeros((len(self.bodies), 3)))
-            is_enough = len(other_m) >= LEAST_INSTANTS
+            is_enough = len(other_m) >= path_fit.LEAST_INSTANTS
             own_m, seen_m = other_m[:, :2], track_m[:, :2]
             if is_enough and self.known.with_scale:
                 own_m = own_m * _turn_between(own_m, seen_m)[1]
@@ -269,7 +253,7 @@ class Problem:
         state = self.start(offset_s)
         if state is None:
             return None
-        fit = fit_paths(thin(self.bodies, _ROUGH_INSTANTS), state, self.freedom())
+        fit = path_fit.fit_paths(thin(self.bodies, _ROUGH_INSTANTS), state, self.freedom())
         if fit is None:
             return None
         return _Candidate(fit.state.offset_s, fit.likelihood, int(fit.kept.sum()), None)
@@ -307,7 +291,9 @@ class Problem:
         if state is None:
             return None
         drifting = first.drifting and self._drifting(self.bodies[0], first.offset_s)
-        measured = fit_paths(self.bodies, state, self.freedom(), SCAN_S if drifting is None else _NEAR_S)
+        measured = path_fit.fit_paths(
+            self.bodies, state, self.freedom(), path_fit.SCAN_S if drifting is None else _NEAR_S
+        )
         if measured is not None and (drifting is None or _is_measured(measured, drifting)):
             return ChosenFit(measured, None)
         if drifting is None:
@@ -317,12 +303,15 @@ class Problem:
         aligned = self.start(drifting.offset_s, pivots_m)
         assert aligned is not None
         fixed = replace(self.freedom(), offset=False, drift=False, pivots=())
-        constant = fit_white(self.bodies, aligned, fixed)
+        constant = path_fit.fit_white(self.bodies, aligned, fixed)
         return None if constant is None else ChosenFit(constant, drifting)
 
     def _differs(self, fit: ChosenFit) -> bool:
         if fit.drifting is not None:
-            return turn_misfit(self.bodies, fit.drifting.offset_s) > LARGEST_TURN_MISFIT
+            return (
+                path_cleaning.turn_misfit(self.bodies, fit.drifting.offset_s)
+                > path_cleaning.LARGEST_TURN_MISFIT
+            )
         largest_m = max(extent_m(body.track_m) for body in self.bodies)
         lengths_m = np.linalg.norm(fit.measured.linear.position, axis=1)
         return float(np.median(lengths_m)) > _LARGEST_SHARE * largest_m
@@ -331,7 +320,7 @@ class Problem:
         """Raise an error that names the unit if lengths of both systems differ by a factor."""
         offset_s = self._coarse_s()[0]
         other_m, track_m = self._common(offset_s, np.zeros((len(self.bodies), 3)))
-        if len(other_m) < LEAST_INSTANTS:
+        if len(other_m) < path_fit.LEAST_INSTANTS:
             return
         _, scale = _turn_between(other_m[:, :2], track_m[:, :2])
         misfit_m = _turned_misfit_m(scale * other_m[:, :2], track_m[:, :2])
@@ -340,7 +329,7 @@ class Problem:
             start = self.start(offset_s)
             assert start is not None
             free = replace(self.freedom(), offset=False, drift=False, scale=True)
-            fit = fit_white(self.bodies, replace(start, log_scale=float(np.log(scale))), free)
+            fit = path_fit.fit_white(self.bodies, replace(start, log_scale=float(np.log(scale))), free)
             scale = scale if fit is None else float(np.exp(fit.state.log_scale))
             raise self._other_scale(scale)
 
@@ -351,7 +340,7 @@ class Problem:
         )
 
 
-def _is_measured(measured: PathFit, drifting: DriftFit) -> bool:
+def _is_measured(measured: path_fit.PathFit, drifting: DriftFit) -> bool:
     """Return whether a path has the errors of a measurement rather than those of dead reckoning."""
     assert measured.noise is not None
     if any(one > limit for one, limit in zip(measured.noise.smooth, _LARGEST_FIELD, strict=False)):

@@ -20,7 +20,7 @@ from ipsys_log.errors import IpsysError, LogError
 from ipsys_log.log.codec import encode
 from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.dataset import Session
-from ipsys_log.log.hashing import ChannelHash
+from ipsys_log.log.hashing import ChannelHash, hash_messages
 from ipsys_log.log.known_contents import one_reading
 from ipsys_log.log.location import LogLocation
 from ipsys_log.log.part import Choose, copy_messages, copy_records
@@ -66,11 +66,16 @@ def cut(
     """
     check_copy(paths, output, overwrite)
     with Session(paths) as session:
-        _check_ids(session)
+        if session.has_new_ids:  # in one log, the later measurement would replace the other one
+            raise LogError(f"{session}: two logs have measurements with the same id; cut the logs one by one")
         selection = select(session, options)
         with create_copy(output, overwrite) as writer:
             _copy(session, writer, selection, progress)
-            channels = _channel_cuts(session, writer, selection)
+            channels = tuple(
+                _channel_cut(session, writer, selection, topic)
+                for topic in selection.rules
+                if topic != CUTS.topic and session.count(topic)  # earlier records of cuts are left out
+            )
             if not any(one.kept for one in channels if selection.is_ranged(one.topic)):
                 raise IpsysError(
                     f"{session}: no message is selected besides the settings; widen the range, or leave out "
@@ -82,12 +87,6 @@ def cut(
             write_message(writer, Message(CUTS.topic, last_ns, last_ns, record), {})
         counts = [(one.kept, one.messages, one.kept > 0) for one in channels]
     return CutResult(*(sum(column) for column in zip(*counts, strict=True)))
-
-
-def _check_ids(session: Session) -> None:
-    """Refuse logs whose measurements have the same ids: in one log, the later one would replace the other."""
-    if session.has_new_ids:
-        raise LogError(f"{session}: two logs have measurements with the same id; cut the logs one by one")
 
 
 def _copy(session: Session, writer: LogWriter, selection: Selection, progress: Progress) -> None:
@@ -102,15 +101,6 @@ def _copy(session: Session, writer: LogWriter, selection: Selection, progress: P
         copy_records(reader, writer)
         before += reader.size
         advance(0)
-
-
-def _channel_cuts(session: Session, writer: LogWriter, selection: Selection) -> tuple[ChannelCut, ...]:
-    """Return the entries of all channels with messages, except the earlier records of cuts."""
-    return tuple(
-        _channel_cut(session, writer, selection, topic)
-        for topic in selection.rules
-        if topic != CUTS.topic and session.count(topic)
-    )
 
 
 def _channel_cut(session: Session, writer: LogWriter, selection: Selection, topic: str) -> ChannelCut:
@@ -130,11 +120,8 @@ def _channel_cut(session: Session, writer: LogWriter, selection: Selection, topi
 def _hash_in_log_order(session: Session, topic: str, choose: Choose) -> ChannelHash:
     """Return the hash of the selected messages of a channel that is not in log order in its file."""
     streams = [reader.messages([topic]) for reader in session.readers if topic in reader.channels]
-    state = ChannelHash()
-    for message in heapq.merge(*streams, key=lambda message: message.log_time_ns):
-        if choose(topic, np.array([message.log_time_ns]))[0]:
-            state.add(message.log_time_ns, message.publish_time_ns, message.data)
-    return state
+    messages = heapq.merge(*streams, key=lambda message: message.log_time_ns)
+    return hash_messages(one for one in messages if choose(topic, np.array([one.log_time_ns]))[0])
 
 
 # The number that a new run gets if the name of its branch is taken: poly, poly_2, poly_3.

@@ -14,7 +14,7 @@ from ipsys_log.engine.provenance import newest_run
 from ipsys_log.engine.request import Progress
 from ipsys_log.errors import FitError, IpsysError
 from ipsys_log.log.dataset import Session
-from ipsys_log.log.hashing import ChannelHash
+from ipsys_log.log.hashing import ChannelHash, hash_messages
 from ipsys_log.log.known_contents import one_reading
 from ipsys_log.log.location import LogLocation, is_one_of
 from ipsys_log.log.merged_logs import merge_messages, merged
@@ -233,17 +233,9 @@ def _states(plan: MergePlan, writer: LogWriter) -> dict[str, ChannelHash]:
     topics = sorted({topic for source in plan.sources for topic in source.topics})
     states = {topic: writer.hash_of(topic) for topic in topics}
     for topic, state in states.items():
-        if not state.valid:
-            states[topic] = _hash_in_log_order(plan, topic)
+        if not state.valid:  # the channel is not in log order in the merged file
+            states[topic] = hash_messages(message for _, message in merged(plan.sources, [topic]))
     return states
-
-
-def _hash_in_log_order(plan: MergePlan, topic: str) -> ChannelHash:
-    """Return the hash of a channel that is not in log order in the merged file."""
-    state = ChannelHash()
-    for _, message in merged(plan.sources, [topic]):
-        state.add(message.log_time_ns, message.publish_time_ns, message.data)
-    return state
 
 
 def _record(session: Session, plan: MergePlan, number: int, states: dict[str, ChannelHash]) -> MergedLog:

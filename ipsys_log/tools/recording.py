@@ -1,7 +1,5 @@
 """The recording in a log: the frames of each camera, their gaps, and the events by kind."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -36,7 +34,7 @@ class CameraRecording:
     frames: int
     start_ns: int
     end_ns: int
-    gaps: FrameGaps
+    gaps: "FrameGaps"
 
 
 @dataclass(frozen=True, slots=True)

@@ -43,13 +43,8 @@ def models(fit: JointFit) -> dict[str, JointModel]:
 
 
 @pytest.fixture(scope="module")
-def sizes_px(models: dict[str, JointModel]) -> dict[str, tuple[int, int]]:
-    return dict.fromkeys(models, (1920, 1080))
-
-
-@pytest.fixture(scope="module")
-def expected(models: dict[str, JointModel], sizes_px: dict[str, tuple[int, int]]) -> list[ExpectedErrors]:
-    return expect_errors(models, sizes_px, GRID, HEIGHT_M, LENGTH_M)
+def expected(models: dict[str, JointModel]) -> list[ExpectedErrors]:
+    return expect_errors(models, dict.fromkeys(models, (1920, 1080)), GRID, HEIGHT_M, LENGTH_M)
 
 
 def tape_m2(points_m: Array) -> Array:
@@ -80,19 +75,15 @@ def test_two_updates_give_the_information_of_both(slopes: Array) -> None:
     assert np.abs(both @ both.T - np.linalg.inv(information)).max() < 1e-9
 
 
-def test_no_point_is_planned_twice(
-    models: dict[str, JointModel], sizes_px: dict[str, tuple[int, int]], expected: list[ExpectedErrors]
-) -> None:
+def test_no_point_is_planned_twice(expected: list[ExpectedErrors]) -> None:
     candidates_m = np.array([[2.0, 2.0], [2.4, 2.4], [2.8, 2.6], [90.0, 90.0]])
-    points = choose_points(models, sizes_px, expected, candidates_m, tape_m2, LENGTH_M, 0.0, 5)
+    points = choose_points(expected, candidates_m, tape_m2, 0.0, 5)
     assert sorted(point.point_m.tolist() for point in points) == candidates_m[:3].tolist()
 
 
-def test_planned_points_reduce_the_error_at_every_node(
-    models: dict[str, JointModel], sizes_px: dict[str, tuple[int, int]], expected: list[ExpectedErrors]
-) -> None:
+def test_planned_points_reduce_the_error_at_every_node(expected: list[ExpectedErrors]) -> None:
     candidates_m = np.array([[x, y, z] for x in (0.8, 2.4, 4.0) for y in (1.2, 3.2) for z in (0.0, 0.2)])
-    plan = plan_joint_points(models, sizes_px, expected, candidates_m, tape_m2, LENGTH_M, 3)
+    plan = plan_joint_points(expected, candidates_m, tape_m2, 3)
     seen = np.isfinite(plan.before_m)
     assert (plan.after_m[seen] <= plan.before_m[seen]).all()
     means_m = [plan.places[0].mean_before_m, *(place.mean_after_m for place in plan.places)]
@@ -102,21 +93,17 @@ def test_planned_points_reduce_the_error_at_every_node(
     assert means_m[-1] < 0.95 * means_m[0]
 
 
-def test_plan_outside_of_all_images_is_refused(
-    models: dict[str, JointModel], sizes_px: dict[str, tuple[int, int]], expected: list[ExpectedErrors]
-) -> None:
+def test_plan_outside_of_all_images_is_refused(expected: list[ExpectedErrors]) -> None:
     with pytest.raises(IpsysError, match="no camera sees a whole marker"):
-        plan_joint_points(models, sizes_px, expected, np.array([[90.0, 90.0, 0.0]]), tape_m2, LENGTH_M, 1)
+        plan_joint_points(expected, np.array([[90.0, 90.0, 0.0]]), tape_m2, 1)
 
 
 def test_effect_of_a_drive_is_that_of_all_its_unknowns(
-    models: dict[str, JointModel], sizes_px: dict[str, tuple[int, int]], expected: list[ExpectedErrors]
+    models: dict[str, JointModel], expected: list[ExpectedErrors]
 ) -> None:
     """A robot at one place: one large system with its x, y and heading gives the same error."""
     place_m, around_m = np.array([2.4, 2.4]), np.full(2, 0.15)
-    drive = choose_drive(
-        models, sizes_px, expected, place_m - around_m, place_m + around_m, HEIGHT_M, LENGTH_M
-    )
+    drive = choose_drive(expected, place_m - around_m, place_m + around_m, HEIGHT_M)
     assert drive is not None
     assert drive.cameras == ("c0", "c1")
     count = next(iter(models.values())).modes.shape[1]
@@ -143,12 +130,12 @@ def test_effect_of_a_drive_is_that_of_all_its_unknowns(
 
 
 def test_planned_drive_is_seen_and_reduces_the_error(
-    models: dict[str, JointModel], sizes_px: dict[str, tuple[int, int]], expected: list[ExpectedErrors]
+    models: dict[str, JointModel], expected: list[ExpectedErrors]
 ) -> None:
-    drive = choose_drive(models, sizes_px, expected, np.zeros(2), np.full(2, 4.8), HEIGHT_M, LENGTH_M)
+    drive = choose_drive(expected, np.zeros(2), np.full(2, 4.8), HEIGHT_M)
     assert drive is not None
     assert drive.is_useful
     assert ((drive.high_m - drive.low_m) > 0.5).all()
     assert set(drive.cameras) <= set(models)
-    beside = choose_drive(models, sizes_px, expected, np.full(2, 90.0), np.full(2, 92.0), HEIGHT_M, LENGTH_M)
+    beside = choose_drive(expected, np.full(2, 90.0), np.full(2, 92.0), HEIGHT_M)
     assert beside is None

@@ -12,9 +12,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from ipsys_log.api.batch import execution
+from ipsys_log.api.batch import tasks
 from ipsys_log.api.batch.execution import run_batch
-from ipsys_log.api.batch.tasks import BatchTask
 from ipsys_log.api.batch.workers import WorkerSettings, open_workers
 from ipsys_log.errors import IpsysError
 from tests.batch.piece_works import compute_and_note, replay_pieces
@@ -35,10 +34,10 @@ def main(text: str) -> None:
     try:
         with open_workers(settings, request.get("tasks", len(logs))) as workers:
             workers.client.wait_for_workers(1, timeout=PATIENCE_S)
-            task = BatchTask(replay_and_note, {"notes": Path(request["notes"])})
+            task = tasks.BatchTask(replay_and_note, {"notes": Path(request["notes"])})
             if request.get("pieces"):
-                task = BatchTask(replay_pieces, divides=True)
-                vars(execution)["compute_alone"] = compute_and_note
+                task = tasks.BatchTask(replay_pieces, divides=True)
+                vars(tasks)["compute_alone"] = compute_and_note
             results = [asdict(result) for result in run_batch(workers, task, logs)]
     except IpsysError as error:
         sys.stdout.write(json.dumps({"error": str(error)}))

@@ -14,7 +14,7 @@ from ipsys_log.capture.backlog import TICK, Backlog
 from ipsys_log.capture.recorder import _QUIET_TICKS, Recording, open_recording, write_each
 from ipsys_log.errors import IpsysError, LogError
 from ipsys_log.log.dataset import Session
-from ipsys_log.log.journal import Disk
+from ipsys_log.log.journal import Storage
 from ipsys_log.log.reader import LogReader
 from ipsys_log.log.recovery import repair
 from ipsys_log.log.writer import LogWriter
@@ -197,7 +197,7 @@ def test_killed_recorder_has_lost_at_most_a_second(tmp_path: Path) -> None:
         assert last_kept_ns() == message.log_time_ns  # no message comes: everything is written
 
 
-class FullDisk(Disk):
+class FullDisk(Storage):
     """A disk with room for 100 kB, and for more when space is freed."""
 
     freed = threading.Event()
@@ -205,7 +205,7 @@ class FullDisk(Disk):
     def pwrite(self, fd: int, data: bytes | memoryview, offset: int) -> int:
         if offset + len(data) > 100_000 and not self.freed.is_set():
             raise OSError(errno.ENOSPC, "No space left on device")
-        return Disk.pwrite(self, fd, data, offset)
+        return Storage.pwrite(self, fd, data, offset)
 
 
 def test_full_disk_drops_frames_and_writes_other_messages(
@@ -293,7 +293,7 @@ def test_old_journal_is_removed_with_its_log(tmp_path: Path, whole: bool) -> Non
     assert not journal.exists()
 
 
-class Killed(Disk):
+class Killed(Storage):
     """A process that is killed while a journal exists."""
 
     def truncate(self, fd: int, size: int) -> None:  # noqa: ARG002

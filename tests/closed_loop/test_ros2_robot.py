@@ -15,7 +15,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.live_runs.robot_runs.ros2_relay import open_ros2
-from ipsys_log.sinks.streams.poses import PoseSource
+from ipsys_log.sinks.streams import StreamSettings
+from ipsys_log.sinks.streams.poses import StreamContext
 from ipsys_log.sinks.streams.ros2 import Ros2Stream
 from ipsys_log.units import NS_PER_S
 from tests.closed_loop.example_robot import example
@@ -71,8 +72,8 @@ def test_decoder_ignores_other_bytes(data: bytes) -> None:
 def publishing() -> Iterator[Ros2Stream]:
     now_ns = lambda: START_NS  # noqa: E731
     robots = {"ada": None, "bob": None}
-    source = PoseSource({TOPIC}, now_ns, 1)
-    with closing(Ros2Stream(free_port(), 0, None, source, now_ns, lambda kind, text: None, robots)) as stream:
+    context = StreamContext(StreamSettings(), {TOPIC}, now_ns, lambda kind, text: None, 1, robots)
+    with closing(Ros2Stream(free_port(), context)) as stream:
         yield stream
 
 

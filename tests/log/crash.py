@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 
-from ipsys_log.log.journal import DISK
+from ipsys_log.log.journal import DISK, Storage
 
 SECTOR = 512
 
@@ -29,8 +29,8 @@ class Operation:
 
 
 @dataclass(slots=True)
-class Recorder:
-    """A `Storage` that does all operations for real and notes them."""
+class Recorder(Storage):
+    """A storage that does all operations for real and notes them."""
 
     operations: list[Operation] = field(default_factory=list)
     _files: dict[int, int] = field(default_factory=dict)

@@ -16,7 +16,7 @@ from ipsys_log.errors import LogError
 from ipsys_log.log import reader as reader_module
 from ipsys_log.log.byte_source import LogBytes
 from ipsys_log.log.contents import Contents
-from ipsys_log.log.journal import Disk, journal_path, replace_tail
+from ipsys_log.log.journal import Storage, journal_path, replace_tail
 from ipsys_log.log.reader import LogReader
 from ipsys_log.log.recovery import repair
 from ipsys_log.log.summary import load_contents
@@ -180,7 +180,7 @@ def test_outdated_journal_is_not_rolled_back(tmp_path: Path) -> None:
 def _crash_after_truncate(path: Path, whole: bytes) -> None:
     path.write_bytes(whole)
 
-    class Crashing(Disk):
+    class Crashing(Storage):
         def pwrite(self, fd: int, data: bytes | memoryview, offset: int) -> int:
             if os.fstat(fd).st_ino == path.stat().st_ino:
                 raise OSError(5, "crash")

@@ -28,10 +28,11 @@ from websockets.typing import Origin, Subprotocol
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import CompressedImage, Event, Message
 from ipsys_log.sinks.sink import DropReport
+from ipsys_log.sinks.streams import StreamSettings
 from ipsys_log.sinks.streams import foxglove as foxglove_stream
 from ipsys_log.sinks.streams.foxglove import FoxgloveStream
 from ipsys_log.sinks.streams.foxglove_messages import SUBPROTOCOLS, Subscriptions
-from ipsys_log.sinks.streams.poses import NewSession
+from ipsys_log.sinks.streams.poses import NewSession, StreamContext
 from ipsys_log.statistics.latency import PositionState
 from tests.node_packages import install
 from tests.sinks.open_sockets import exposed, open_sockets
@@ -46,9 +47,9 @@ _LIMIT_S = 240.0
 def streaming(**options: Any) -> Iterator[tuple[FoxgloveStream, list[tuple[str, str]]]]:
     events: list[tuple[str, str]] = []
     warn = lambda kind, text: events.append((kind, text))  # noqa: E731
-    stream = FoxgloveStream(
-        0, options.pop("host", None), SECRET, 7, options.pop("topics", [TOPIC]), warn, **options
-    )
+    images, topics = options.pop("with_images", False), options.pop("topics", [TOPIC])
+    settings = StreamSettings(host=options.pop("host", None), secret=SECRET, images=images)
+    stream = FoxgloveStream(0, StreamContext(settings, topics, lambda: START_NS, warn, 7, **options))
     with closing(stream):
         yield stream, events
 
@@ -369,5 +370,5 @@ def test_slow_client_loses_images_before_other_messages(monkeypatch: pytest.Monk
 
 def test_port_in_use_is_named() -> None:
     with streaming() as (stream, _), pytest.raises(IpsysError) as error:
-        FoxgloveStream(stream.port, None, SECRET, 1, (), lambda kind, text: None)
+        FoxgloveStream(stream.port, StreamContext(StreamSettings(), (), lambda: 0, lambda *_: None, 1))
     assert f"--foxglove: port {stream.port} is in use, perhaps by another ipsys" in str(error.value)

@@ -20,7 +20,8 @@ from scipy.spatial.transform import Rotation
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Message
-from ipsys_log.sinks.streams.poses import NewSession, PoseSource
+from ipsys_log.sinks.streams import StreamSettings
+from ipsys_log.sinks.streams.poses import NewSession, StreamContext
 from ipsys_log.sinks.streams.rmw_zenoh import Entity, Qos, attachment, gid, topic_key
 from ipsys_log.sinks.streams.ros2 import Ros2Stream
 from ipsys_log.sinks.streams.ros2_messages import type_hash
@@ -64,16 +65,12 @@ def streaming(
 ) -> Iterator[tuple[Ros2Stream, list[str]]]:
     events: list[str] = []
     now_ns = lambda: START_NS + round(age_s * NS_PER_S)  # noqa: E731
-    stream = Ros2Stream(
-        free_port() if port is None else port,
-        options.pop("domain", 0),
-        options.pop("host", None),
-        PoseSource({TOPIC}, now_ns, 7, positions=options.pop("positions", None)),
-        now_ns,
-        lambda kind, text: events.append(text),
-        options.pop("heights_m", {"ada": 0.1, "bob": None}),
-        is_replayed,
-    )
+    settings = StreamSettings(ros2_domain=options.pop("domain", 0), host=options.pop("host", None))
+    warn = lambda kind, text: events.append(text)  # noqa: E731
+    heights_m = options.pop("heights_m", {"ada": 0.1, "bob": None})
+    positions = options.pop("positions", None)
+    context = StreamContext(settings, {TOPIC}, now_ns, warn, 7, heights_m, is_replayed, positions)
+    stream = Ros2Stream(free_port() if port is None else port, context)
     with closing(stream):
         yield stream, events
 
@@ -295,7 +292,7 @@ def test_second_stream_uses_the_router_that_answers() -> None:
 
         wait_until(arrives, "a pose arrives")
         with pytest.raises(IpsysError, match=f"--ros2: another ipsys is on port {port} already"):
-            Ros2Stream(port, 0, None, PoseSource((), lambda: 0, 1), lambda: 0, lambda *_: None, {})
+            Ros2Stream(port, StreamContext(StreamSettings(), (), lambda: 0, lambda *_: None, 1))
 
 
 def test_only_this_machine_can_connect_without_a_host() -> None:
@@ -309,8 +306,9 @@ def test_only_this_machine_can_connect_without_a_host() -> None:
 
 
 def refusal(port: int, host: str | None = None, domain: int = 0) -> str:
+    settings = StreamSettings(ros2_domain=domain, host=host)
     with pytest.raises(IpsysError) as error, suppress(KeyboardInterrupt):
-        Ros2Stream(port, domain, host, PoseSource((), lambda: 0, 1), lambda: 0, lambda *_: None, {})
+        Ros2Stream(port, StreamContext(settings, (), lambda: 0, lambda *_: None, 1))
     assert "\n" not in str(error.value)
     return str(error.value)
 

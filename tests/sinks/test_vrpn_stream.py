@@ -20,7 +20,8 @@ from scipy.spatial.transform import Rotation
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Message
-from ipsys_log.sinks.streams.poses import PoseSource
+from ipsys_log.sinks.streams import StreamSettings
+from ipsys_log.sinks.streams.poses import StreamContext
 from ipsys_log.sinks.streams.vrpn import VrpnStream
 from ipsys_log.units import NS_PER_S
 from tests.conftest import ROOT
@@ -86,8 +87,10 @@ class Served(NamedTuple):
 @contextmanager
 def serving(*robots: str, host: str | None = None) -> Iterator[Served]:
     events: list[str] = []
-    poses = PoseSource({TOPIC}, lambda: START_NS, 1)
-    server = VrpnStream(0, host, poses, lambda kind, text: events.append(f"{kind}: {text}"), robots)
+    warn = lambda kind, text: events.append(f"{kind}: {text}")  # noqa: E731
+    heights_m = dict.fromkeys(robots)
+    context = StreamContext(StreamSettings(host=host), {TOPIC}, lambda: START_NS, warn, 1, heights_m)
+    server = VrpnStream(0, context)
     with closing(server):
         yield Served(server, events)
 
@@ -311,10 +314,11 @@ def test_port_in_use_is_refused() -> None:
         serving() as served,
         pytest.raises(IpsysError, match=f"port {served.server.port} is in use") as error,
     ):
-        VrpnStream(served.server.port, None, PoseSource((), lambda: 0, 1), lambda kind, text: None)
+        VrpnStream(served.server.port, StreamContext(StreamSettings(), (), lambda: 0, lambda *_: None, 1))
     assert "\n" not in str(error.value)
 
 
 def test_foreign_host_is_refused() -> None:
+    context = StreamContext(StreamSettings(host="192.0.2.77"), (), lambda: 0, lambda *_: None, 1)
     with pytest.raises(IpsysError, match=r"--host 192\.0\.2\.77: is not an address of this machine"):
-        VrpnStream(0, "192.0.2.77", PoseSource((), lambda: 0, 1), lambda kind, text: None)
+        VrpnStream(0, context)

@@ -26,8 +26,7 @@ from uvicorn.server import ServerState
 
 from ipsys_log.app.cli.pages import say_faults
 from ipsys_log.app.web.app import build_app
-from ipsys_log.app.web.connections import PageLimits, derive_limits
-from ipsys_log.app.web.server import PageServer, ServerExceptions, serve_app
+from ipsys_log.app.web.server import PageLimits, PageServer, ServerExceptions, derive_limits, serve_app
 from ipsys_log.errors import IpsysError
 from ipsys_log.live_runs.survey.scene import CameraView
 from ipsys_log.log.dataset import Session
@@ -131,7 +130,7 @@ def test_recorder_survives_idle_connections(still_lab: Lab, tmp_path: Path) -> N
 
 
 def test_used_private_parts_of_uvicorn_are_unchanged() -> None:
-    """A new version of uvicorn may change them: then compare ``connections.py`` with its source."""
+    """A new version of uvicorn may change them: then compare ``server.py`` with its source."""
     assert list(signature(H11Protocol).parameters)[:3] == ["config", "server_state", "app_state"]
     methods = ("connection_made", "connection_lost", "on_response_complete", "send_400_response")
     assert [name for name in methods if not callable(getattr(H11Protocol, name, None))] == []

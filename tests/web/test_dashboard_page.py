@@ -17,9 +17,9 @@ import pytest
 import simplejpeg
 
 from ipsys_log.app.cli.pages import serve_dashboard
-from ipsys_log.app.web.connections import PageLimits
 from ipsys_log.app.web.dashboard.operator import Operator
 from ipsys_log.app.web.dashboard.state import Dashboard, DashboardSetting
+from ipsys_log.app.web.server import PageLimits
 from ipsys_log.engine.request import Request
 from ipsys_log.errors import IpsysError
 from ipsys_log.live_runs import pipeline

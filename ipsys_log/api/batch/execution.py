@@ -18,17 +18,7 @@ from functools import partial
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from ipsys_log.api.batch.tasks import (
-    FAILED,
-    BatchTask,
-    LogResult,
-    LongLog,
-    OtherSoftwareError,
-    VersionError,
-    compute_alone,
-    perform,
-    perform_or_divide,
-)
+from ipsys_log.api.batch import tasks
 from ipsys_log.api.batch.workers import Workers
 from ipsys_log.engine.pieces import PiecePlan, PieceResult
 from ipsys_log.engine.provenance import fingerprint
@@ -101,16 +91,16 @@ class _Log:
     attempts: _Attempts = field(default_factory=_Attempts)
     is_divided: bool = True
     in_pieces: bool = False
-    detected: LogResult | None = None
+    detected: tasks.LogResult | None = None
     alone: bool = False
 
 
 def run_batch(
     workers: Workers,
-    task: BatchTask,
+    task: tasks.BatchTask,
     paths: Sequence[LogLocation],
     show_pieces: ShowPieces = lambda path, done, total: None,
-) -> Iterator[LogResult]:
+) -> Iterator[tasks.LogResult]:
     """Do a task on each log; yield the results as they arrive, in any order.
 
     The number of tasks at once is bounded, so the memory does not grow with the number of logs.
@@ -143,7 +133,7 @@ class _Batch:
     def __init__(
         self,
         workers: Workers,
-        task: BatchTask,
+        task: tasks.BatchTask,
         paths: Sequence[LogLocation],
         show_pieces: ShowPieces,
         threads: ThreadPoolExecutor,
@@ -151,8 +141,8 @@ class _Batch:
         self._workers, self._task, self._show, self._threads = workers, task, show_pieces, threads
         self._waiting = deque(map(_Log, paths))
         self._alone: deque[_Log] = deque()
-        self._running: dict[Future | ThreadFuture[LogResult], _Log] = {}
-        self._arrived: SimpleQueue[Future | ThreadFuture[LogResult]] = SimpleQueue()
+        self._running: dict[Future | ThreadFuture[tasks.LogResult], _Log] = {}
+        self._arrived: SimpleQueue[Future | ThreadFuture[tasks.LogResult]] = SimpleQueue()
         # One group for all tasks: Dask keeps statistics of each group.
         self._name, self._submitted, self._done = f"ipsys-{secrets.token_hex(4)}", 0, 0
         self._window = workers.window()
@@ -169,27 +159,27 @@ class _Batch:
 
     def _start(self, log: _Log) -> None:
         task = self._task.of_log(log.path)
-        future: Future | ThreadFuture[LogResult]
+        future: Future | ThreadFuture[tasks.LogResult]
         if log.in_pieces:
             future = self._threads.submit(self._detect, task, log.path)
         else:
             if log.detected is not None and "outdated" in task.options:  # its detection is new now
                 task = replace(task, options={**task.options, "outdated": False})
             may_divide = task.divides and log.is_divided and log.detected is None
-            work = perform_or_divide if may_divide else perform
+            work = tasks.perform_or_divide if may_divide else tasks.perform
             key = (self._name, self._submitted)
             self._submitted += 1
             future = self._workers.client.submit(work, task, log.path, key=key, pure=False)
         self._running[future] = log
         future.add_done_callback(self._arrived.put)
 
-    def _detect(self, task: BatchTask, path: LogLocation) -> LogResult:
+    def _detect(self, task: tasks.BatchTask, path: LogLocation) -> tasks.LogResult:
         """Compute the first stage of a long log by pieces. For a thread."""
         pieces = DaskPieces(self._workers, partial(self._show, path))
-        result = perform(replace(task, options={**task.options, "workers": pieces}), path)
+        result = tasks.perform(replace(task, options={**task.options, "workers": pieces}), path)
         return replace(result, pieces=pieces.count or None)
 
-    def take(self) -> LogResult | None:
+    def take(self) -> tasks.LogResult | None:
         """Wait for a task; return the result of its log, or None if the log needs further tasks."""
         future = _next_of(self._arrived, self._workers)
         log = self._running.pop(future)
@@ -207,13 +197,13 @@ class _Batch:
             self._window = self._workers.window()
         return answer
 
-    def _answer(self, future: Future | ThreadFuture[LogResult], log: _Log) -> LogResult | None:
+    def _answer(self, future: Future | ThreadFuture[tasks.LogResult], log: _Log) -> tasks.LogResult | None:
         """Return the result of a task; None after the log waits for another one."""
         try:
             answer = log.attempts.result_of(future, self._workers)
-        except VersionError:
+        except tasks.VersionError:
             raise
-        except OtherSoftwareError:
+        except tasks.OtherSoftwareError:
             log.in_pieces = log.is_divided = False
             self._waiting.appendleft(log)
             return None
@@ -226,16 +216,16 @@ class _Batch:
         finally:
             if not isinstance(future, ThreadFuture):
                 future.release()
-        if isinstance(answer, LongLog):
+        if isinstance(answer, tasks.LongLog):
             log.in_pieces = True
             self._waiting.appendleft(log)
             return None
         if answer is None:
             return self._repeat(log)
-        result: LogResult = answer
+        result: tasks.LogResult = answer
         return result
 
-    def _repeat(self, log: _Log) -> LogResult | None:
+    def _repeat(self, log: _Log) -> tasks.LogResult | None:
         """Let a log wait again; give it up after too many ended workers, the last one alone."""
         if log.attempts.ended < MOST_ENDED_WORKERS - 1:
             self._waiting.append(log)
@@ -306,7 +296,7 @@ class DaskPieces:
     def _start(self, plan: PiecePlan, software: dict[str, str], place: int, attempts: _Attempts) -> None:
         # A piece comes before the logs that wait.
         future = self._workers.client.submit(
-            compute_alone, plan.run, plan.pieces[place], software, pure=False, priority=1
+            tasks.compute_alone, plan.run, plan.pieces[place], software, pure=False, priority=1
         )
         self._running[future] = place, attempts
         future.add_done_callback(self._arrived.put)
@@ -327,7 +317,7 @@ def _next_of(arrived: SimpleQueue[Arrived], workers: Workers) -> Arrived:
             workers.check_connection()
 
 
-def _joined(detected: LogResult, later: LogResult) -> LogResult:
+def _joined(detected: tasks.LogResult, later: tasks.LogResult) -> tasks.LogResult:
     """Return the result of a log whose first stage was computed by pieces, and the others by a worker."""
     return replace(
         later,
@@ -339,5 +329,5 @@ def _joined(detected: LogResult, later: LogResult) -> LogResult:
     )
 
 
-def _failure(log: _Log, text: str) -> LogResult:
-    return LogResult(str(log.path), FAILED, False, text)
+def _failure(log: _Log, text: str) -> tasks.LogResult:
+    return tasks.LogResult(str(log.path), tasks.FAILED, False, text)

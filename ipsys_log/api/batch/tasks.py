@@ -4,13 +4,11 @@ A task runs in a worker process, perhaps on another machine. Each task can run t
 runs, and a run that exists is not computed again. The first task of a long log only reports that it is long.
 """
 
-from __future__ import annotations
-
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from ipsys_log import __version__
 from ipsys_log.engine.execute import one_blas_thread
@@ -106,7 +104,7 @@ class BatchTask:
     version: str = __version__
     stage_versions: Mapping[str, int] = field(default_factory=lambda: dict(VERSIONS))
 
-    def of_log(self, path: LogLocation) -> BatchTask:
+    def of_log(self, path: LogLocation) -> Self:
         """Return the task of one log."""
         if path not in self.targets:
             return self

@@ -1,7 +1,5 @@
 """The command ``ipsys``: parse, open, make one library call, print."""
 
-from __future__ import annotations
-
 import errno
 import shutil
 import sys

@@ -1,7 +1,5 @@
 """The command ``ipsys``: all commands in their groups, their help, and old names."""
 
-from __future__ import annotations
-
 import copy
 import functools
 import re

@@ -1,7 +1,5 @@
 """``ipsys compare``: score a robot's own estimates against its tracks."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Any
 

@@ -1,7 +1,5 @@
 """Collections of logs: ``ipsys catalogue`` lists them, ``pack`` publishes them, ``score`` repeats scores."""
 
-from __future__ import annotations
-
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated

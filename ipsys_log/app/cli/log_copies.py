@@ -17,7 +17,6 @@ from ipsys_log.units import format_bytes
 
 if TYPE_CHECKING:
     from ipsys_log.tools.cut import DroppedRun
-    from ipsys_log.tools.merge import MergeResult
     from ipsys_log.tools.merge_plan import LogOffset
 
 _NEW_LOG = "The log to write, with a name that ends in .mcap."
@@ -145,7 +144,16 @@ def _compact(
         "output": None if written is None else str(written),
         "bytes": size,
         "output_bytes": after,
-        "dropped": [_dropped_json(one) for one in dropped],
+        "dropped": [
+            {
+                "run": one.run.run,
+                "reason": one.run.reason,
+                "stages": one.run.stages,
+                "messages": one.messages,
+                "stored_bytes": one.stored_bytes,
+            }
+            for one in dropped
+        ],
     }
     print_result(value, saved, as_json)
 
@@ -190,7 +198,12 @@ def merge(
         result = merge_logs(logs, output, offsets, overwrite, progress)
     lines = _offset_lines(logs, offsets)
     written = f"{output} written: {result.messages} messages, {format_bytes(output.stat().st_size)}"
-    print_result(_merge_json(output, result), [*lines, written], as_json)
+    rows = [
+        {"name": log.name, "offset_ns": log.offset_ns, "offset_sigma_s": log.offset_sigma_s}
+        for log in result.logs
+    ]
+    value = {"output": str(output), "messages": result.messages, "logs": rows}
+    print_result(value, [*lines, written], as_json)
     if not as_json:
         say(f"next: ipsys replay {shell_words(output)}")
 
@@ -206,28 +219,7 @@ def _dropped_lines(log: LogLocation, size: int, dropped: list[DroppedRun]) -> It
     yield f"{counted(len(dropped), 'run')}, about {format_bytes(gained)} of {format_bytes(size)}"
 
 
-def _dropped_json(one: DroppedRun) -> dict[str, Any]:
-    return {
-        "run": one.run.run,
-        "reason": one.run.reason,
-        "stages": one.run.stages,
-        "messages": one.messages,
-        "stored_bytes": one.stored_bytes,
-    }
-
-
 def _offset_lines(logs: Sequence[LogLocation], offsets: Sequence[LogOffset]) -> Iterator[str]:
     for path, offset in zip(logs[1:], offsets[1:], strict=True):
         sigma = "" if offset.sigma_s is None else f" (estimated, sigma {offset.sigma_s * 1e3:.2f} ms)"
         yield f"{path}: {offset.offset_ns / 1e9:+.6f} s are added to its times{sigma}"
-
-
-def _merge_json(output: Path, result: MergeResult) -> dict[str, Any]:
-    return {
-        "output": str(output),
-        "messages": result.messages,
-        "logs": [
-            {"name": log.name, "offset_ns": log.offset_ns, "offset_sigma_s": log.offset_sigma_s}
-            for log in result.logs
-        ],
-    }

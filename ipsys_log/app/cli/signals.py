@@ -6,8 +6,6 @@ once. The first signal of a command that runs until it is stopped gives exit cod
 plus its number, as shells do. A signal that the process inherited as ignored stays ignored (``nohup``).
 """
 
-from __future__ import annotations
-
 import functools
 import os
 import signal

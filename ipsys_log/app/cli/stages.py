@@ -36,10 +36,6 @@ if TYPE_CHECKING:
     from ipsys_log.log.dataset import Session
 
 
-def _stage_lines() -> str:
-    return "\n\n".join(f"{entry.name}: {entry.help}" for entry in ENTRIES)
-
-
 # The options of every stage, and of the printed results.
 _SHARED: dict[str, cli.Option] = {
     "logs": (cli.Logs, cli.REQUIRED),
@@ -80,6 +76,7 @@ _ORDER = (
 _UNTIL = option(
     str | None, "--until", "STAGE", f"Stop after this stage: {', '.join(STAGE_NAMES)}. Default: fuse."
 )
+_STAGE_LINES = "\n\n".join(f"{entry.name}: {entry.help}" for entry in ENTRIES)
 _REPLAY = f"""
 Run the missing stages of a log, append their results to it, and print the accuracy.
 
@@ -87,7 +84,7 @@ Without --model, the command continues the newest run, with its model and settin
 joint to a log with markers and their heights, and best to any other log; a line says why. These are all
 stages in their order; smooth only runs with --until smooth:
 
-{_stage_lines()}
+{_STAGE_LINES}
 
 Examples
 

@@ -1,7 +1,5 @@
 """Views of a log in other programs: ``ipsys view``, ``report`` and ``export``."""
 
-from __future__ import annotations
-
 import json
 import sys
 from collections.abc import Sequence

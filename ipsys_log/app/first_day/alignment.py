@@ -1,7 +1,5 @@
 """The alignment of a folder as data of a page: an arrow on the image of each camera, and advice."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

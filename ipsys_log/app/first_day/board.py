@@ -1,7 +1,5 @@
 """The calibration board of the setup: its typed fields, and the search for pictures of it."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The cameras that a lab can use: of the rig, attached, simulated or typed, each with a picture."""
 
-from __future__ import annotations
-
 import re
 import sys
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence

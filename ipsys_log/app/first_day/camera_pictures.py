@@ -1,21 +1,11 @@
 """The pictures of the cameras that a lab can use, and the camera of the address typed last."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ipsys_log.app.first_day.camera_choice import (
-    ADDRESS_FIELDS,
-    add_camera,
-    fault_text,
-    list_attached,
-    list_options,
-    propose_names,
-    take_picture,
-)
+from ipsys_log.app.first_day import camera_choice
 from ipsys_log.app.first_day.jobs import Job
 from ipsys_log.capture.devices import source_opener
 from ipsys_log.capture.frames import AccessRefusedError
@@ -56,14 +46,16 @@ class CameraPictures:
     def attached(self) -> Sequence[UsbCamera]:
         """Return the attached cameras of the last search."""
         if self._attached is None:
-            self._attached = list_attached()
+            self._attached = camera_choice.list_attached()
         return self._attached
 
     def describe(self, rig: Rig | None) -> list[dict[str, Any]]:
         """Return the cameras as plain data, without passwords."""
         rows = []
-        options = list_options(rig, self.attached())
-        for (key, text, camera), proposal in zip(options, propose_names(options, rig), strict=True):
+        options = camera_choice.list_options(rig, self.attached())
+        for (key, text, camera), proposal in zip(
+            options, camera_choice.propose_names(options, rig), strict=True
+        ):
             taken = self._pictures.get(key)
             picture = f"picture/camera/{taken.number}" if taken is not None and taken.data else None
             fault = "" if taken is None else taken.fault
@@ -74,7 +66,7 @@ class CameraPictures:
     def describe_address(self) -> Mapping[str, Any]:
         """Return the form of an address: its labels, the last fault, and the number of added cameras."""
         fault = None if self._fault is None else self._fault._asdict()
-        return {"labels": ADDRESS_FIELDS, "fault": fault, "added": self._added}
+        return {"labels": camera_choice.ADDRESS_FIELDS, "fault": fault, "added": self._added}
 
     def picture(self, number: str) -> bytes | None:
         """Return the picture with a number; None if there is none."""
@@ -83,9 +75,9 @@ class CameraPictures:
 
     def take_all(self, job: Job) -> None:
         """Search for cameras, and take a picture of each, one after the other."""
-        self._attached = list_attached()
+        self._attached = camera_choice.list_attached()
         rig = load_rig(self._rig_file)
-        for option in list_options(rig, self._attached):
+        for option in camera_choice.list_options(rig, self._attached):
             job.say(f"opening {option.key}")
             data, fault = None, ""
             try:
@@ -110,12 +102,12 @@ class CameraPictures:
                 return
             if data is None:
                 raise IpsysError(_SILENT)
-            add_camera(self._rig_file, camera)
+            camera_choice.add_camera(self._rig_file, camera)
         except AccessRefusedError as error:
-            self._fault = Fault("password", fault_text(error, camera))
+            self._fault = Fault("password", camera_choice.fault_text(error, camera))
         except IpsysError as error:
             if not job.is_stopped():
-                self._fault = Fault("address", fault_text(error, camera))
+                self._fault = Fault("address", camera_choice.fault_text(error, camera))
         else:
             self._keep(hide_password(str(camera.source)), data, "")
             self._added += 1
@@ -126,7 +118,7 @@ class CameraPictures:
 
     def _take(self, rig: Rig, camera: RigCamera, job: Job) -> bytes | None:
         with source_opener(rig, [camera], self._rig_file.parent, job.is_stopped) as opener:
-            return take_picture(camera, opener, job.say, job.is_stopped)
+            return camera_choice.take_picture(camera, opener, job.say, job.is_stopped)
 
     def _keep(self, key: str, data: bytes | None, fault: str) -> None:
         self._number += 1

@@ -1,7 +1,5 @@
 """The parts of the images that a robot has crossed during a drive, for a page."""
 
-from __future__ import annotations
-
 import threading
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any

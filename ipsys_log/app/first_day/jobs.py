@@ -1,7 +1,5 @@
 """The one job of the page: work in its own thread, with its progress, its texts and its end."""
 
-from __future__ import annotations
-
 import threading
 import traceback
 from collections import deque

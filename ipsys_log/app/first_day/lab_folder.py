@@ -1,7 +1,5 @@
 """The folder of a lab: the names of its files, and the facts in its logs that tell the finished steps."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -82,7 +80,7 @@ class FitFacts:
     stale: str
     answer: tuple[str, ...]
     mean_m: float | None
-    outliers: tuple[OutlierPoint, ...]
+    outliers: "tuple[OutlierPoint, ...]"
 
 
 class LabFolder:

@@ -1,7 +1,5 @@
 """Typed fields of a rig with their faults, and changes of the rig file that keep its other lines."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """The setup of a lab as one session: its state as plain data, and the actions of its steps."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict
@@ -16,9 +14,9 @@ from ipsys_log.app.first_day.camera_pictures import CameraPictures
 from ipsys_log.app.first_day.drive import DriveCoverage
 from ipsys_log.app.first_day.jobs import Job, Jobs
 from ipsys_log.app.first_day.lab_folder import FitFacts, LabFolder, exclude_outlier
-from ipsys_log.app.first_day.points_plan import describe_map, propose_places
 from ipsys_log.app.first_day.rig_entry import LABELS, example_rig, rig_fields, rig_warnings, save_rig_entry
 from ipsys_log.app.first_day.steps import SetupProgress, Status, read_progress
+from ipsys_log.app.first_day.work import describe_map, propose_places
 from ipsys_log.app.report.calibration import lab_advice, lab_headline, lab_table
 from ipsys_log.app.report.rows import cm
 from ipsys_log.errors import IpsysError
@@ -197,7 +195,24 @@ class SetupSession:
 
     def print_pdf(self, name: str, typed: Mapping[str, str]) -> bytes:
         """Return a print as PDF: ``markers`` of the rig, or the ``board`` of typed fields."""
-        return _print(self._folder, name, typed)
+        check_installed("a print needs", "matplotlib")
+        from ipsys_log.app.report.prints import board_print, choose_paper, draw_pages, lay_out, rig_prints
+
+        if name == "markers":
+            rig = load_rig(self._folder.rig_file)
+            if not rig.all_markers:
+                raise IpsysError("lab.toml lists no markers; type the ids of the robots, and save them")
+            prints = rig_prints(rig)
+        elif name == "board":
+            entry = parse_board_entry(typed)
+            if isinstance(entry, Fault):
+                raise IpsysError(entry.text)
+            prints = [board_print(entry.parse(), entry.board)]
+        else:
+            raise IpsysError(f"the print {name!r} is not known; reload this page")
+        # A4 means the usual choice: A3 if A4 is too small.
+        paper = typed.get("paper", "A4")
+        return draw_pages(lay_out(prints, choose_paper(prints, None if paper == "A4" else paper)))
 
     def close(self) -> None:
         """Stop the present job in order."""
@@ -296,25 +311,3 @@ def _describe_fit(fit: FitFacts) -> dict[str, Any]:
     """Return the result of the fit: one figure, the points to measure again, and the full answer."""
     figure = "" if fit.mean_m is None else f"Mean distance to the tape points: {cm(fit.mean_m, 1)} cm"
     return {"figure": figure, "outliers": [asdict(one) for one in fit.outliers], "answer": list(fit.answer)}
-
-
-def _print(folder: LabFolder, name: str, typed: Mapping[str, str]) -> bytes:
-    """Return the markers of the rig file, or a board of typed fields, as PDF (``ipsys markers``)."""
-    check_installed("a print needs", "matplotlib")
-    from ipsys_log.app.report.prints import board_print, choose_paper, draw_pages, lay_out, rig_prints
-
-    if name == "markers":
-        rig = load_rig(folder.rig_file)
-        if not rig.all_markers:
-            raise IpsysError("lab.toml lists no markers; type the ids of the robots, and save them")
-        prints = rig_prints(rig)
-    elif name == "board":
-        entry = parse_board_entry(typed)
-        if isinstance(entry, Fault):
-            raise IpsysError(entry.text)
-        prints = [board_print(entry.parse(), entry.board)]
-    else:
-        raise IpsysError(f"the print {name!r} is not known; reload this page")
-    # A4 means the usual choice: A3 if A4 is too small.
-    paper = typed.get("paper", "A4")
-    return draw_pages(lay_out(prints, choose_paper(prints, None if paper == "A4" else paper)))

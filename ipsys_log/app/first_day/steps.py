@@ -1,7 +1,5 @@
 """The steps of the first day: which are done, which can be done, and the missing part of the others."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The accuracy of a session: the evaluations in a log, and their summary as JSON."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple

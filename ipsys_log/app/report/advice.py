@@ -18,8 +18,6 @@ References
 Breiman et al., Classification and Regression Trees, 1984, sect. 3.4.3.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -157,7 +155,7 @@ class _Candidate:
     mean_m: float
     noise_m: float
 
-    def like(self, other: _Candidate) -> bool:
+    def like(self, other: "_Candidate") -> bool:
         """Return whether the difference to another candidate is within the noise."""
         return bool(self.mean_m - other.mean_m <= _CONFIDENCE * np.hypot(self.noise_m, other.noise_m))
 

@@ -1,7 +1,5 @@
 """The alignment of the cameras of a log, their coverage of the floor, and notes on both."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The result of a batch: a table and lines for the terminal, plain data, and a Parquet file."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict

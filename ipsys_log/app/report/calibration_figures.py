@@ -1,7 +1,5 @@
 """Figures of calibrations: residuals in the images of a camera; poses and clocks of a joint calibration."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
@@ -10,15 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon, Rectangle
 from matplotlib.ticker import MaxNLocator
 
-from ipsys_log.app.report.figures import (
-    ERROR_COLOURS,
-    PAGE_IN,
-    add_bar,
-    has_legend,
-    name_cameras,
-    new_figure,
-    style_axes,
-)
+from ipsys_log.app.report import figures
 from ipsys_log.app.report.floor_figure import draw_ground
 from ipsys_log.app.report.styles import NOTE, REST, camera_styles, shorten
 from ipsys_log.calibration.calibrate import CalibrationResult
@@ -35,9 +25,9 @@ _ARROW = 0.04
 
 def poses_figure(cameras: Sequence[CalibratedCamera], rig: Rig | None) -> Figure:
     """Draw the cameras from above and from the side, each with its field of view on the floor."""
-    if not has_legend(len(cameras)):
+    if not figures.has_legend(len(cameras)):
         return _many_poses_figure(cameras, rig)
-    figure = Figure(figsize=(PAGE_IN, 7.0), layout="constrained")
+    figure = Figure(figsize=(figures.PAGE_IN, 7.0), layout="constrained")
     above, beside = figure.subplots(2, 1, height_ratios=[3.2, 1.4])
     _draw_above(above, cameras, rig)
     # Seen along the shorter direction, cameras in a row do not hide one another.
@@ -55,7 +45,7 @@ def _many_poses_figure(cameras: Sequence[CalibratedCamera], rig: Rig | None) -> 
 
     Their views overlap, so that only the shade shows how many cameras see a place.
     """
-    figure = Figure(figsize=(PAGE_IN, 7.6), layout="constrained")
+    figure = Figure(figsize=(figures.PAGE_IN, 7.6), layout="constrained")
     above, heights, sigmas = figure.subplots(3, 1, height_ratios=[3.2, 1.0, 1.0])
     _draw_many_above(above, cameras, rig)
     places = range(len(cameras))
@@ -72,7 +62,7 @@ def _many_poses_figure(cameras: Sequence[CalibratedCamera], rig: Rig | None) -> 
     for axes in (heights, sigmas):
         axes.set_xticks(places, names, rotation=90)
         axes.ticklabel_format(axis="y", useOffset=False)
-        style_axes(axes)
+        figures.style_axes(axes)
     for axes in (above, heights, sigmas):
         axes.tick_params(labelsize=8)
     return figure
@@ -87,7 +77,7 @@ def _draw_many_above(axes: Axes, cameras: Sequence[CalibratedCamera], rig: Rig |
         _draw_axis(axes, camera, NOTE)
     beside_m = 0.03 * float(np.ptp(axes.get_ylim()))
     places_m = {camera.camera: camera.origin_m[:2] - [0.0, beside_m] for camera in cameras}
-    name_cameras(axes, places_m, dict.fromkeys(places_m, NOTE))
+    figures.name_cameras(axes, places_m, dict.fromkeys(places_m, NOTE))
     axes.set_title("From above", loc="left", fontsize=10)
 
 
@@ -118,7 +108,7 @@ def _draw_beside(axes: Axes, cameras: Sequence[CalibratedCamera], axis: int) -> 
     axes.set(xlabel=f"{'xy'[axis]} in m", ylabel="height in m")
     axes.set_ylim(bottom=0.0, top=1.15 * max(float(camera.origin_m[2]) for camera in cameras))
     axes.set_title(f"From the side, along {'yx'[axis]}", loc="left", fontsize=10)
-    style_axes(axes)
+    figures.style_axes(axes)
 
 
 def _pose_label(camera: CalibratedCamera) -> str:
@@ -153,8 +143,8 @@ def has_clocks(cameras: Sequence[CalibratedCamera]) -> bool:
 def clocks_figure(cameras: Sequence[CalibratedCamera]) -> Figure:
     """Draw the clock offset of each camera with two standard deviations."""
     # The labels of many cameras have one line.
-    between, row_in = ("\n", 0.32) if has_legend(len(cameras)) else ("  ", 0.2)
-    figure, axes = new_figure(1.3 + row_in * len(cameras))
+    between, row_in = ("\n", 0.32) if figures.has_legend(len(cameras)) else ("  ", 0.2)
+    figure, axes = figures.new_figure(1.3 + row_in * len(cameras))
     styles = camera_styles(camera.camera for camera in cameras)
     labels = []
     for row, camera in enumerate(cameras):
@@ -167,7 +157,7 @@ def clocks_figure(cameras: Sequence[CalibratedCamera]) -> Figure:
     axes.set_yticks(range(len(cameras)), labels)
     axes.set_ylim(len(cameras) - 0.5, -0.5)
     axes.set_xlabel("time to add to the stamps, in ms")
-    style_axes(axes, "x")
+    figures.style_axes(axes, "x")
     return figure
 
 
@@ -182,22 +172,24 @@ def residuals_figure(camera: CalibratedCamera, most_px: float) -> Figure:
     assert camera.residuals is not None
     assert camera.size_px is not None
     (width, height), residuals = camera.size_px, camera.residuals
-    figure, axes = new_figure(0.95 + PAGE_IN * height / width)
+    figure, axes = figures.new_figure(0.95 + figures.PAGE_IN * height / width)
     axes.add_patch(Rectangle((0, 0), width, height, fill=False, ec="black", lw=1.0))
     x_px, y_px = residuals.cells_px.T
     arrows = axes.quiver(
-        x_px, y_px, *residuals.means_px.T, residuals.rms_px, cmap=ERROR_COLOURS, angles="xy",
+        x_px, y_px, *residuals.means_px.T, residuals.rms_px, cmap=figures.ERROR_COLOURS, angles="xy",
         scale_units="xy", scale=most_px / (_ARROW * width), width=0.005, zorder=3,
     )  # fmt: skip
     arrows.set_clim(0.0, most_px)
-    axes.scatter(x_px, y_px, c=residuals.rms_px, cmap=ERROR_COLOURS, vmin=0.0, vmax=most_px, s=5, zorder=4)
+    axes.scatter(
+        x_px, y_px, c=residuals.rms_px, cmap=figures.ERROR_COLOURS, vmin=0.0, vmax=most_px, s=5, zorder=4
+    )
     axes.set(xlim=(-0.02 * width, 1.02 * width), ylim=(1.02 * height, -0.02 * height), aspect="equal")
     axes.set_xticks([0, width])
     axes.set_yticks([0, height])
     axes.spines[:].set_visible(False)
     label = f"{shorten(camera.camera)}: {residuals.total_rms_px:.3f} px RMS, {residuals.corners} corners"
     axes.set_title(label, loc="left", fontsize=9)
-    bar = add_bar(figure, arrows, axes, "residual in px, RMS of a cell", size=8)
+    bar = figures.add_bar(figure, arrows, axes, "residual in px, RMS of a cell", size=8)
     bar.locator = MaxNLocator(5)
     bar.update_ticks()
     return figure
@@ -206,7 +198,7 @@ def residuals_figure(camera: CalibratedCamera, most_px: float) -> Figure:
 def first_residuals(cameras: Sequence[CalibratedCamera]) -> list[str]:
     """Return the cameras whose residuals a page shows first: of many, those with the largest ones."""
     rms_px = {one.camera: one.residuals.total_rms_px for one in cameras if one.residuals is not None}
-    if has_legend(len(rms_px)):
+    if figures.has_legend(len(rms_px)):
         return list(rms_px)
     return sorted(rms_px, key=lambda name: (-rms_px[name], name))[:_MOST_IMAGES]
 
@@ -244,11 +236,11 @@ def _draw_image(axes: Axes, found: CalibrationResult) -> None:
     top = float(np.quantile(lengths, 0.98))
     order = np.argsort(lengths, kind="stable")
     arrows = axes.quiver(
-        *found.pixels[order].T, *found.residuals_px[order].T, lengths[order], cmap=ERROR_COLOURS,
+        *found.pixels[order].T, *found.residuals_px[order].T, lengths[order], cmap=figures.ERROR_COLOURS,
         clim=(0, top), angles="xy", scale_units="xy", scale=1 / factor, width=0.0028, headwidth=3.5, zorder=3,
     )  # fmt: skip
     x, y = found.pixels[order].T
-    axes.scatter(x, y, c=lengths[order], cmap=ERROR_COLOURS, vmin=0, vmax=top, s=5, lw=0, zorder=2)
+    axes.scatter(x, y, c=lengths[order], cmap=figures.ERROR_COLOURS, vmin=0, vmax=top, s=5, lw=0, zorder=2)
     axes.plot(found.values[2], found.values[3], "+", color=NOTE, ms=12, zorder=4)
     axes.set(
         xlim=(-0.5, width - 0.5),
@@ -282,7 +274,7 @@ def _draw_cloud(axes: Axes, found: CalibrationResult) -> None:
     outside = int((~inside).sum())
     title = f"RMS {found.rms_px:.3f} px (circle), median {found.median_px:.3f}"
     axes.set_title(title + (f"\n{outside} outside this plot" if outside else "\n"), loc="left", fontsize=10)
-    style_axes(axes)
+    figures.style_axes(axes)
 
 
 def _draw_pictures(axes: Axes, found: CalibrationResult) -> None:
@@ -297,4 +289,4 @@ def _draw_pictures(axes: Axes, found: CalibrationResult) -> None:
     axes.set_title(
         f"{len(found.used)} of {found.examined_count} images used{suffix}\n", loc="left", fontsize=10
     )
-    style_axes(axes, "x")
+    figures.style_axes(axes, "x")

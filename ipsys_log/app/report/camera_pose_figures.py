@@ -1,7 +1,5 @@
 """Figures of the poses of cameras: the alignment on the floor and in the images, and the drift over time."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime

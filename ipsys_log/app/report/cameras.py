@@ -1,7 +1,5 @@
 """Live cameras, robots and the recording as tables for a terminal."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from math import degrees

@@ -1,7 +1,5 @@
 """Results of checks and repairs as text and JSON: findings, differences, saved and lost messages."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from math import ceil

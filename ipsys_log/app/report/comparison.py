@@ -1,7 +1,5 @@
 """Comparisons of estimates with the tracks of their robots, as text, as JSON and as figures."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path

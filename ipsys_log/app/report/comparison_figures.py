@@ -1,7 +1,5 @@
 """Figures of comparisons: the paths over the floor, and the errors over time and over distance."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Figures of drives: tracks on the floor, and six instants of a robot run (figure 12 of the paper)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Panel of all errors by model and camera, in cm: points with their mean, and the statistics as numbers."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

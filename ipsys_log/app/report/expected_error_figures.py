@@ -1,7 +1,5 @@
 """Figures of the expected error over the floor: of a joint calibration, and of a measuring plan."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Figures as bytes (equal figures give equal bytes), the common style of their axes, and names of cameras."""
 
-from __future__ import annotations
-
 import base64
 import io
 import warnings

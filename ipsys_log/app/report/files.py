@@ -1,7 +1,5 @@
 """Output files: written completely or not at all, and never over a log."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack

@@ -1,7 +1,5 @@
 """The floor to scale: calibration points with their errors, and the tracks of robots."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

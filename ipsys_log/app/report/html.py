@@ -1,7 +1,5 @@
 """The report of a session as one self-contained HTML page: no network, no scripts, no fonts, no clock."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

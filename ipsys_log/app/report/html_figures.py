@@ -10,15 +10,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 
+from ipsys_log.app.report import calibration_figures, points_figures
 from ipsys_log.app.report.advice import has_published, label
-from ipsys_log.app.report.calibration_figures import (
-    clocks_figure,
-    first_residuals,
-    has_clocks,
-    poses_figure,
-    residual_limit_px,
-    residuals_figure,
-)
 from ipsys_log.app.report.drive_figures import draw_tracks, read_drawn_tracks
 from ipsys_log.app.report.figures import PAGE_IN, add_bar, has_legend, new_figure, style_axes, svg_data_uri
 from ipsys_log.app.report.findings import Findings
@@ -29,14 +22,6 @@ from ipsys_log.app.report.paper_figures import (
     draw_residuals,
     residual_scale,
     shown_models,
-)
-from ipsys_log.app.report.points_figures import (
-    Curves,
-    camera_curves,
-    curves_picture,
-    draw_coverage,
-    limits_cm,
-    mean_curves,
 )
 from ipsys_log.app.report.styles import robot_colour, shorten
 from ipsys_log.app.report.tables import height_note
@@ -110,7 +95,10 @@ def learning_pictures(findings: Findings) -> list[Picture]:
     """Return the learning curves over all cameras on random subsets, in space and on the floor."""
     text = "Mean {} error over all cameras, fitted on random subsets. Bars: one standard deviation"
     return _curves_pictures(
-        {text.format(_SPACE[in_space]): mean_curves(findings, in_space) for in_space in _spaces(findings)}
+        {
+            text.format(_SPACE[in_space]): points_figures.mean_curves(findings, in_space)
+            for in_space in _spaces(findings)
+        }
     )
 
 
@@ -124,18 +112,18 @@ def published_pictures(findings: Findings) -> list[Picture]:
         return []
     return _curves_pictures(
         {
-            text.format(_SPACE[in_space], camera): camera_curves(findings, camera, in_space)
+            text.format(_SPACE[in_space], camera): points_figures.camera_curves(findings, camera, in_space)
             for in_space in _spaces(findings)
             for camera in findings.cameras
         }
     )
 
 
-def _curves_pictures(panels: Mapping[str, Curves]) -> list[Picture]:
+def _curves_pictures(panels: Mapping[str, points_figures.Curves]) -> list[Picture]:
     """Return one figure per caption, all with the same scale."""
-    limits = limits_cm(panels.values())
+    limits = points_figures.limits_cm(panels.values())
     return [
-        picture(curves_picture(curves, PAGE_IN, limits), caption)
+        picture(points_figures.curves_picture(curves, PAGE_IN, limits), caption)
         for caption, curves in panels.items()
         if curves
     ]
@@ -151,29 +139,29 @@ def joint_pictures(findings: Findings) -> list[Picture]:
         return []
     pictures = [
         picture(
-            poses_figure(cameras, findings.rig),
+            calibration_figures.poses_figure(cameras, findings.rig),
             "Poses of the cameras, with their fields of view on the floor. Arrow: optical axis, to the floor",
         )
     ]
-    if has_clocks(cameras):
+    if calibration_figures.has_clocks(cameras):
         text = (
             "Clock offsets of the cameras. Bars: two standard deviations. A constant clock is the "
             "reference, or that of a camera that saw no drive"
         )
         text = ". ".join([text, *(f"Contradiction: {line}" for line in findings.clock_contradictions)])
-        pictures.append(picture(clocks_figure(cameras), text))
-    return pictures + _residuals_pictures(cameras, first_residuals(cameras))
+        pictures.append(picture(calibration_figures.clocks_figure(cameras), text))
+    return pictures + _residuals_pictures(cameras, calibration_figures.first_residuals(cameras))
 
 
 def other_residual_pictures(findings: Findings) -> list[Picture]:
     """Return the residuals in the images that :func:`joint_pictures` leaves out."""
-    first = first_residuals(findings.calibrated)
+    first = calibration_figures.first_residuals(findings.calibrated)
     names = [one.camera for one in findings.calibrated if one.residuals is not None]
     return _residuals_pictures(findings.calibrated, [name for name in names if name not in first])
 
 
 def _residuals_pictures(cameras: Sequence[CalibratedCamera], names: Sequence[str]) -> list[Picture]:
-    pictures, most_px = [], residual_limit_px(cameras)
+    pictures, most_px = [], calibration_figures.residual_limit_px(cameras)
     known = {one.camera: one for one in cameras}
     for name in names:
         residuals = known[name].residuals
@@ -182,7 +170,7 @@ def _residuals_pictures(cameras: Sequence[CalibratedCamera], names: Sequence[str
             f"Corner residuals in the image of {name}, estimated minus measured, as means of cells; "
             f"arrows are enlarged{_left_out(residuals.outliers)}"
         )
-        pictures.append(picture(residuals_figure(known[name], most_px), caption))
+        pictures.append(picture(calibration_figures.residuals_figure(known[name], most_px), caption))
     return pictures
 
 
@@ -199,7 +187,7 @@ def coverage_picture(findings: Findings) -> Picture | None:
     if not findings.training_m():
         return None
     figure, axes = new_figure(5.2)
-    draw_coverage(axes, findings)
+    points_figures.draw_coverage(axes, findings)
     return picture(
         figure, "Calibration points of the models. Hatched: floor outside the area of these points"
     )

@@ -1,7 +1,5 @@
 """Sections of the HTML page: text and numbers for its templates, and their caveats."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

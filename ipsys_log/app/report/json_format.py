@@ -1,7 +1,5 @@
 """JSON of the commands: SI units, one key with one meaning; and the keys of format 1, for one release."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass

@@ -1,7 +1,5 @@
 """Figure of the latency: the time from a frame to its position, and the parts of the steps."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 Long parts and bytes of a message are given by their size.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict

@@ -1,7 +1,5 @@
 """Scores of a dataset: the answer of a re-scoring, its table, and plain data."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 

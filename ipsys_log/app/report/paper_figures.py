@@ -1,7 +1,5 @@
 """The tables and figures of the paper, and some more, as files in a folder."""
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Callable, Iterable, Sequence
@@ -15,28 +13,12 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.quiver import Quiver
 
-from ipsys_log.app.report import calibration_figures
+from ipsys_log.app.report import calibration_figures, floor_figure, points_figures
 from ipsys_log.app.report.accuracy import Accuracy
 from ipsys_log.app.report.advice import has_published, label
 from ipsys_log.app.report.figures import ERROR_COLOURS, figure_bytes, scale_logarithmic, style_axes
 from ipsys_log.app.report.files import write_files
 from ipsys_log.app.report.findings import Findings, errors_in, overall_row
-from ipsys_log.app.report.floor_figure import (
-    Square,
-    arrow_factor,
-    draw_arrows,
-    draw_ground,
-    draw_key,
-    show_square,
-    square_around,
-)
-from ipsys_log.app.report.points_figures import (
-    draw_hulls,
-    learning_figure,
-    mean_curves,
-    places_figure,
-    published_figure,
-)
 from ipsys_log.app.report.styles import NOTE, model_styles
 from ipsys_log.app.report.tables import height_note
 from ipsys_log.errors import IpsysError
@@ -56,7 +38,7 @@ class ResidualScale(NamedTuple):
 
     most_cm: float
     factor: int
-    square: Square
+    square: floor_figure.Square
 
 
 def shown_models(findings: Findings) -> list[Accuracy]:
@@ -72,12 +54,14 @@ def shown_models(findings: Findings) -> list[Accuracy]:
 def residual_scale(findings: Findings, accuracies: Sequence[Accuracy]) -> ResidualScale:
     """Return one scale for the maps of all these models, so that the maps can be compared by eye."""
     places_m, errors_m, lengths_cm = _point_errors(findings, accuracies)
-    square = square_around(findings.rig, [places_m])
-    factor = arrow_factor(list(errors_m), 2 * square.half)
+    square = floor_figure.square_around(findings.rig, [places_m])
+    factor = floor_figure.arrow_factor(list(errors_m), 2 * square.half)
     # Make room for the arrows, while the floor stays large.
     reach_m = 1.01 * np.abs(places_m + factor * errors_m - square.middle).max()
     half_m = float(np.clip(reach_m, square.half, _WIDER * square.half))
-    return ResidualScale(float(np.quantile(lengths_cm, 0.95)), factor, Square(square.middle, half_m))
+    return ResidualScale(
+        float(np.quantile(lengths_cm, 0.95)), factor, floor_figure.Square(square.middle, half_m)
+    )
 
 
 def residuals_figure(findings: Findings) -> Figure:
@@ -102,18 +86,18 @@ def residuals_figure(findings: Findings) -> Figure:
 def draw_residuals(axes: Axes, findings: Findings, accuracy: Accuracy, scale: ResidualScale) -> Quiver:
     """Draw one model's mean error at each point as an arrow on the floor, coloured by its length in space."""
     places_m, errors_m, lengths_cm = _point_errors(findings, [accuracy])
-    draw_ground(axes, findings.rig, [places_m])
-    draw_hulls(axes, findings)
-    show_square(axes, scale.square)
+    floor_figure.draw_ground(axes, findings.rig, [places_m])
+    points_figures.draw_hulls(axes, findings)
+    floor_figure.show_square(axes, scale.square)
     factor = scale.factor
     # The largest errors are drawn last, on top of the others.
     order = np.argsort(lengths_cm, kind="stable")
     places_m, errors_m, lengths_cm = places_m[order], errors_m[order], lengths_cm[order]
     look = {"cmap": ERROR_COLOURS, "norm": Normalize(0, scale.most_cm)}
-    arrows = draw_arrows(axes, places_m, errors_m, factor, lengths_cm, **look)
+    arrows = floor_figure.draw_arrows(axes, places_m, errors_m, factor, lengths_cm, **look)
     x_m, y_m = places_m.T
     axes.scatter(x_m, y_m, c=lengths_cm, s=14, zorder=3.5, lw=0, **look)  # type: ignore[arg-type]
-    draw_key(axes, arrows, factor)
+    floor_figure.draw_key(axes, arrows, factor)
     scheme = "cross-validated errors" if accuracy.rows(True) else "errors at held-out points"
     times = f"arrows {factor} times true length" if factor > 1 else ""
     axes.set_title(f"{label(accuracy.model)}: {scheme}\n{times}", loc="left", fontsize=10)
@@ -257,13 +241,16 @@ _TABLES: dict[str, tuple[Callable[[Findings], bool], Callable[[Findings], bytes]
 }
 # The same for each figure.
 _DRAWN: dict[str, tuple[Callable[[Findings], bool], Callable[[Findings], Figure]]] = {
-    "figure_9": (lambda f: bool(f.training_m() or f.test_m()), places_figure),
+    "figure_9": (lambda f: bool(f.training_m() or f.test_m()), points_figures.places_figure),
     "figure_10": (
         lambda f: has_published(f.evaluations) and f.in_space,
-        lambda f: published_figure(f, in_space=True),
+        lambda f: points_figures.published_figure(f, in_space=True),
     ),
-    "figure_11": (lambda f: has_published(f.evaluations), lambda f: published_figure(f, False)),
-    "learning_curve": (lambda f: bool(mean_curves(f, False)), learning_figure),
+    "figure_11": (
+        lambda f: has_published(f.evaluations),
+        lambda f: points_figures.published_figure(f, False),
+    ),
+    "learning_curve": (lambda f: bool(points_figures.mean_curves(f, False)), points_figures.learning_figure),
     "errors_floor": (lambda f: bool(shown_models(f)), residuals_figure),
     "models": (lambda f: bool(f.accuracies), models_figure),
     "camera_poses": (

@@ -1,7 +1,5 @@
 """Figures of calibration points and of learning curves: figures 9, 10 and 11 of the paper, and others."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -14,23 +12,7 @@ from matplotlib.ticker import MaxNLocator
 from matplotlib.transforms import ScaledTranslation
 from scipy.spatial import ConvexHull, QhullError
 
-from ipsys_log.app.report.advice import (
-    HEIGHT_NOTE,
-    Curve,
-    CurvePoint,
-    camera_curve,
-    label,
-    mean_curve,
-    uses_height,
-)
-from ipsys_log.app.report.figures import (
-    has_legend,
-    legend_label,
-    name_cameras,
-    scale_logarithmic,
-    set_ticks,
-    style_axes,
-)
+from ipsys_log.app.report import advice, figures
 from ipsys_log.app.report.findings import Findings
 from ipsys_log.app.report.floor_figure import draw_ground
 from ipsys_log.app.report.styles import NOTE, REST, TEST, ModelStyle, camera_styles, model_styles, shorten
@@ -109,10 +91,10 @@ def draw_hulls(axes: Axes, findings: Findings, fill: bool = False) -> None:
             middles_m[camera], colours[camera] = corners_m.mean(axis=0), styles[camera].name
             if fill:
                 axes.add_patch(Polygon(corners_m, fc="white", ec="none", zorder=1.5))
-            text = legend_label(f"camera {shorten(camera)}", len(training_m))
+            text = figures.legend_label(f"camera {shorten(camera)}", len(training_m))
             edge = styles[camera].edge
             axes.add_patch(Polygon(corners_m, fill=False, zorder=2.2, label=text, **edge))
-    name_cameras(axes, middles_m, colours)
+    figures.name_cameras(axes, middles_m, colours)
 
 
 class _Style(NamedTuple):
@@ -126,7 +108,7 @@ class _Style(NamedTuple):
 def _styles(findings: Findings) -> dict[str, _Style]:
     """Return the styles of the cameras; the hulls of many overlap, and 24 colours would hide the errors."""
     training_m, styles = findings.training_m(), camera_styles(findings.cameras)
-    if not has_legend(len(training_m)):
+    if not figures.has_legend(len(training_m)):
         quiet = _Style(NOTE, {"ec": REST, "lw": 0.7}, {"marker": "o", "color": NOTE, "ms": 2.5})
         return dict.fromkeys(training_m, quiet)
     found = {camera: styles.get(camera, (NOTE, "o")) for camera in training_m}
@@ -152,11 +134,11 @@ def draw_coverage(axes: Axes, findings: Findings) -> None:
     styles = _styles(findings)
     for camera, points_m in training_m.items():
         axes.plot(*points_m[:, :2].T, ls="none", zorder=3, **styles[camera].points)
-    if has_legend(len(training_m)):
+    if figures.has_legend(len(training_m)):
         axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=3, frameon=False, fontsize=9)
 
 
-Curves = Mapping[str, Curve]
+Curves = Mapping[str, advice.Curve]
 
 # Above this ratio of the largest mean to the smallest, the scale is logarithmic to show small values.
 _LOG_RATIO = 8.0
@@ -169,12 +151,12 @@ _SPACE = {True: "Mean 3D error in cm", False: "Mean 2D error in cm"}
 
 def camera_curves(findings: Findings, camera: str, in_space: bool) -> Curves:
     """Return the curves of one camera on the labelled subsets, by model."""
-    return _some({e.model: camera_curve(e, camera, True, in_space) for e in findings.evaluations})
+    return _some({e.model: advice.camera_curve(e, camera, True, in_space) for e in findings.evaluations})
 
 
 def mean_curves(findings: Findings, in_space: bool) -> Curves:
     """Return the curves over all cameras on random subsets, by model."""
-    return _some({e.model: mean_curve(e, False, in_space) for e in findings.evaluations})
+    return _some({e.model: advice.mean_curve(e, False, in_space) for e in findings.evaluations})
 
 
 def _some(curves: Curves) -> Curves:
@@ -199,7 +181,7 @@ def learning_figure(findings: Findings) -> Figure:
 
 
 def _figure(panels: Mapping[str, Curves], title: str, ylabel: str) -> Figure:
-    columns = len(panels) if has_legend(len(panels)) else _MOST_COLUMNS
+    columns = len(panels) if figures.has_legend(len(panels)) else _MOST_COLUMNS
     rows = -(-len(panels) // columns)
     figure = Figure(figsize=(4.0 * columns + 2.6, 0.6 + 4.0 * rows), layout="constrained")
     styles = model_styles(dict.fromkeys(model for curves in panels.values() for model in curves))
@@ -236,7 +218,7 @@ def curves_picture(curves: Curves, width_in: float, limits: tuple[float, float])
 def _note(models: Iterable[str]) -> str:
     """Return the title of the legend."""
     order = "sorted by the right ends"
-    return f"{order}\n{HEIGHT_NOTE}" if any(map(uses_height, models)) else order
+    return f"{order}\n{advice.HEIGHT_NOTE}" if any(map(advice.uses_height, models)) else order
 
 
 def _by_end(panels: Sequence[Curves]) -> list[str]:
@@ -249,7 +231,9 @@ def _by_end(panels: Sequence[Curves]) -> list[str]:
 
 
 def _handle(model: str, style: ModelStyle) -> Line2D:
-    return Line2D([], [], color=style.colour, ls=style.line, lw=1.4, label=label(model), **style.marker)
+    return Line2D(
+        [], [], color=style.colour, ls=style.line, lw=1.4, label=advice.label(model), **style.marker
+    )
 
 
 def limits_cm(panels: Iterable[Curves]) -> tuple[float, float]:
@@ -265,7 +249,7 @@ def limits_cm(panels: Iterable[Curves]) -> tuple[float, float]:
     return min(point.mean_m for point in points) * CM_PER_M, high_m * CM_PER_M
 
 
-def _bar(point: CurvePoint) -> tuple[float, float]:
+def _bar(point: advice.CurvePoint) -> tuple[float, float]:
     """Return the lower and upper end of the bar of a point, in m.
 
     If the spread is nearly as large as the mean or larger, the lower end is the mean.
@@ -289,20 +273,20 @@ def draw_curves(
         _draw_curve(axes, curve, styles[model], _APART_PT * (number - (len(curves) - 1) / 2))
     places = sorted({point.places for curve in curves.values() for point in curve})
     if places:
-        scale_logarithmic(axes, "x", places[0] / 1.2, places[-1] * 1.2)
-        set_ticks(axes, "x", places)
+        figures.scale_logarithmic(axes, "x", places[0] / 1.2, places[-1] * 1.2)
+        figures.set_ticks(axes, "x", places)
     if high_cm > _LOG_RATIO * low_cm:
-        scale_logarithmic(axes, "y", low_cm / 1.35, high_cm * 1.2)
+        figures.scale_logarithmic(axes, "y", low_cm / 1.35, high_cm * 1.2)
     else:
         axes.set_ylim(0, high_cm * 1.08)
     axes.set_xlabel("points per camera")
     axes.tick_params(labelsize=9)
-    style_axes(axes)
+    figures.style_axes(axes)
     if not curves:
         axes.text(0.5, 0.5, "no data", transform=axes.transAxes, ha="center", color=NOTE)
 
 
-def _draw_curve(axes: Axes, curve: Curve, style: ModelStyle, shift_pt: float) -> None:
+def _draw_curve(axes: Axes, curve: advice.Curve, style: ModelStyle, shift_pt: float) -> None:
     x = [point.places for point in curve]
     y = [point.mean_m * CM_PER_M for point in curve]
     axes.plot(x, y, style.line, color=style.colour, lw=1.4, zorder=3, **style.marker)

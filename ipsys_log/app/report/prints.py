@@ -1,7 +1,5 @@
 """Markers and calibration boards for print, on pages at true size with cutting marks and a ruler."""
 
-from __future__ import annotations
-
 import io
 import textwrap
 from collections.abc import Sequence
@@ -134,7 +132,7 @@ class Paper:
     width_mm: float
     height_mm: float
 
-    def landscape(self) -> Paper:
+    def landscape(self) -> "Paper":
         """Return the sheet in landscape orientation."""
         return Paper(self.name, self.height_mm, self.width_mm)
 
@@ -209,7 +207,8 @@ def draw_pages(pages: Sequence[Page]) -> bytes:
             for placed in page.placed:
                 _draw_black(axes, placed)
                 if placed.item.is_board:
-                    _draw_board_text(axes, placed.item)
+                    text = "\n".join(placed.item.lines)
+                    _write(axes, _EDGE_MM + RULER_MM + 8, _EDGE_MM + 5.5, text, 7.0)
                 else:
                     _draw_marker_text(axes, placed)
                     _draw_cutting_marks(axes, placed)
@@ -308,10 +307,6 @@ def _draw_marker_text(axes: Axes, placed: Placed) -> None:
     size_pt = 5.0 if width_mm < 60 else 8.0
     text = "\n".join(("front: this way up" if width_mm >= 60 else "front", *marker.lines))
     _write(axes, left_mm + 4.5, bottom_mm + 2.75, text, size_pt)
-
-
-def _draw_board_text(axes: Axes, board: Print) -> None:
-    _write(axes, _EDGE_MM + RULER_MM + 8, _EDGE_MM + 5.5, "\n".join(board.lines), 7.0)
 
 
 def _write(axes: Axes, x_mm: float, y_mm: float, text: str, size_pt: float) -> None:

@@ -1,7 +1,5 @@
 """The results of a robot run as tables for a terminal, as JSON, and as an HTML page."""
 
-from __future__ import annotations
-
 import base64
 from typing import Any
 

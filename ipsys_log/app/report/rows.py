@@ -1,7 +1,5 @@
 """One model of a table, for a terminal and for a page; and lengths and shares as its cells."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from textwrap import wrap

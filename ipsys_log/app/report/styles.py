@@ -3,8 +3,6 @@
 The hues are those of Okabe and Ito (2008). Their yellow is left out: it is hard to see on white paper.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 

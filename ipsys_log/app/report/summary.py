@@ -1,7 +1,5 @@
 """The summary of an evaluation in sentences: the best model, its error and the outliers."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from typing import Any
 

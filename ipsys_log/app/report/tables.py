@@ -1,7 +1,5 @@
 """The tables of an evaluation: errors of models and tracks, outliers, and the model to use."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Sequence
 from textwrap import wrap

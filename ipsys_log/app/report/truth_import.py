@@ -1,7 +1,5 @@
 """The result of an import of ground truth, as text and as JSON."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The app of the measuring page: it answers the requests, one at a time."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -14,14 +12,7 @@ from starlette.routing import Route
 from ipsys_log.app.report.styles import camera_styles
 from ipsys_log.app.web.requests import ERROR_HANDLERS, MOST_DIGITS, file_routes, read_json, whole_number
 from ipsys_log.errors import IpsysError
-from ipsys_log.live_runs.survey.checks import (
-    EntryCheck,
-    baseline_names,
-    check_entry,
-    next_id,
-    read_baseline,
-    withdrawal_of,
-)
+from ipsys_log.live_runs.survey import checks
 from ipsys_log.live_runs.survey.entry import TypedEntry, parse_entry
 from ipsys_log.live_runs.survey.scene import CameraView, MeasuringScene, observe_marker, visible_markers
 from ipsys_log.messages import Measurement
@@ -44,7 +35,7 @@ def scene_json(scene: MeasuringScene) -> dict[str, Any]:
         "references": [{"name": p.name, "x_m": p.x_m, "y_m": p.y_m} for p in rig.reference_points],
         "floor": None if rig.floor is None else [rig.floor.width_m, rig.floor.depth_m],
         "one_line": are_collinear(points_m),
-        "baseline": {"names": baseline_names(rig), "counts": rig.ab_sigma_m is not None},
+        "baseline": {"names": checks.baseline_names(rig), "counts": rig.ab_sigma_m is not None},
         "stops": [
             {"marker": interval.marker_id, "seconds": (interval.end_ns - interval.start_ns) / NS_PER_S}
             for interval in scene.intervals
@@ -74,7 +65,7 @@ def history_json(scene: MeasuringScene) -> dict[str, Any]:
         if measurement.refers_to is None
     ]
     measured = [next((m.id for m in active if interval.covers(m)), None) for interval in scene.intervals]
-    return {"next": next_id(history), "places": rows, "measured": measured}
+    return {"next": checks.next_id(history), "places": rows, "measured": measured}
 
 
 def _tapes(measurement: Measurement) -> str:
@@ -136,7 +127,7 @@ def _invitation(visible: Sequence[int]) -> str:
     return f"choose the marker: {', '.join(map(str, visible))} are visible"
 
 
-def checked_json(checked: EntryCheck) -> dict[str, Any]:
+def checked_json(checked: checks.EntryCheck) -> dict[str, Any]:
     """Return the result of the check of an entry."""
     point = None if checked.point_m is None else checked.point_m.tolist()
     return {
@@ -236,16 +227,16 @@ class _Questions:
         """Append a reading of the distance between the first two reference points."""
         scene, text = self._scene, str((await read_json(request)).get("distance", ""))
         time_ns = max((view.time_ns for view in scene.views(None)), default=0)
-        reading = read_baseline(text, scene.rig, scene.history(), time_ns)
+        reading = checks.read_baseline(text, scene.rig, scene.history(), time_ns)
         scene.add([reading])
         return JSONResponse({"saved": reading.id, "history": history_json(scene)})
 
     async def undo(self, request: Request) -> Response:
         name = str((await read_json(request)).get("id", ""))
-        self._scene.add([withdrawal_of(self._scene.history(), name)])
+        self._scene.add([checks.withdrawal_of(self._scene.history(), name)])
         return JSONResponse({"withdrawn": name, "history": history_json(self._scene)})
 
-    def _checked(self, body: Mapping[str, Any]) -> EntryCheck:
+    def _checked(self, body: Mapping[str, Any]) -> checks.EntryCheck:
         scene, distances = self._scene, body.get("distances", {})
         if not isinstance(distances, dict):
             raise IpsysError("distances must be an object, by reference point")
@@ -256,7 +247,7 @@ class _Questions:
         observations = None
         if entry.marker_id is not None:
             observations = observe_marker(scene.views(interval), entry.marker_id)
-        return check_entry(entry, faults, scene.rig, observations, scene.history(), scene.model)
+        return checks.check_entry(entry, faults, scene.rig, observations, scene.history(), scene.model)
 
     def _stop(self, given: Any) -> int | None:
         if not self._scene.intervals:

@@ -1,7 +1,5 @@
 """Requests of the pages: who may read and write, which device operates, their JSON, and their errors."""
 
-from __future__ import annotations
-
 import hmac
 import json
 import secrets

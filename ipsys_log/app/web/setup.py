@@ -1,7 +1,5 @@
 """The app of the setup page: its files, its state, its actions, and the pages of measuring and tracking."""
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -16,18 +14,10 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from ipsys_log.app.first_day.lab_folder import LabFolder
 from ipsys_log.app.first_day.session import Pages, SetupSession
 from ipsys_log.app.first_day.work import LiveRecording
+from ipsys_log.app.web import requests
 from ipsys_log.app.web.app import build_app
 from ipsys_log.app.web.dashboard.app import build_dashboard, dashboard_of_recording
 from ipsys_log.app.web.dashboard.state import Dashboard
-from ipsys_log.app.web.requests import (
-    ERROR_HANDLERS,
-    MAY_WRITE,
-    OperatorSeat,
-    answer_claim,
-    file_routes,
-    operator_of,
-    read_json,
-)
 from ipsys_log.errors import IpsysError
 from ipsys_log.live_runs.survey.entry import Fault
 from ipsys_log.live_runs.survey.live import LiveScene
@@ -73,11 +63,11 @@ class SetupApp:
 
     def __init__(self, folder: LabFolder) -> None:
         self._measuring, self._dashboard = _Embedded(), _Embedded()
-        self._seat = OperatorSeat()
+        self._seat = requests.OperatorSeat()
         self.session = SetupSession(folder, Pages(self._show_measuring, self._show_dashboard))
         self.app = Starlette(
             routes=[
-                *file_routes("setup", _SCRIPTS, "first_day", ("make", "operator")),
+                *requests.file_routes("setup", _SCRIPTS, "first_day", ("make", "operator")),
                 Route("/picture/{kind}/{name}", self._picture),
                 Route("/print/{name}.pdf", self._print),
                 Route("/api/state", self._state),
@@ -86,7 +76,7 @@ class SetupApp:
                 Mount("/measure", self._measuring),
                 Mount("/live", self._dashboard),
             ],
-            exception_handlers=ERROR_HANDLERS,
+            exception_handlers=requests.ERROR_HANDLERS,
         )
 
     @contextmanager
@@ -106,7 +96,7 @@ class SetupApp:
         # The logs of the folder may be long: another thread reads them.
         state = await asyncio.to_thread(self.session.describe)
         pages = {"measure": self._measuring.app is not None, "live": self._dashboard.app is not None}
-        may = request.scope.get(MAY_WRITE, True)
+        may = request.scope.get(requests.MAY_WRITE, True)
         scene = self._measuring.scene
         count = None if scene is None else len(active_measurements(scene.history()))
         return JSONResponse(
@@ -134,14 +124,14 @@ class SetupApp:
 
     async def _operate(self, request: Request) -> Response:
         """Claim the setup for a device, or release it."""
-        return JSONResponse(answer_claim(self._seat, await read_json(request)))
+        return JSONResponse(requests.answer_claim(self._seat, await requests.read_json(request)))
 
     def _change(self, path: str, act: Callable[[Body], Sequence[Fault] | None]) -> Route:
         """Return the route of a change, which only the operator may make; its work is in another thread."""
 
         async def answer(request: Request) -> Response:
-            body = await read_json(request)
-            self._seat.check(operator_of(body))
+            body = await requests.read_json(request)
+            self._seat.check(requests.operator_of(body))
             faults = await asyncio.to_thread(act, body)
             if not faults:
                 return JSONResponse({})

@@ -5,8 +5,6 @@ more often in the first 30 s if there are few nodes. It asks for frames that did
 priority. All arrivals wait in a queue with a limit; a dropped frame is missing, so the node sends it again.
 """
 
-from __future__ import annotations
-
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -17,17 +15,9 @@ from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 from ipsys_log.capture.frames import Clock, Frame, Say, SourceError, SourceMessage
+from ipsys_log.capture.nodes import wire
 from ipsys_log.capture.nodes.network import AUTHORITY, NodeNetwork, open_centre_session
 from ipsys_log.capture.nodes.stream import NodeStream
-from ipsys_log.capture.nodes.wire import (
-    FrameHeader,
-    NodeState,
-    decode_text,
-    encode_text,
-    frames_key,
-    missing_key,
-    state_key,
-)
 from ipsys_log.messages import RigCamera
 from ipsys_log.messages.rig_file import check_name
 from ipsys_log.units import NS_PER_S
@@ -203,7 +193,7 @@ class _Link:
         self._early: list[Frame | SourceMessage] = []
         self._state_asked_ns = 0
         self._asks_frames = False
-        self._subscriber = session.declare_subscriber(frames_key(node), _directly(self._receive))
+        self._subscriber = session.declare_subscriber(wire.frames_key(node), _directly(self._receive))
 
     def await_node(self, network: NodeNetwork, say: Say) -> Iterator[None]:
         """Yield None until the node has answered; ``say`` reports a longer wait.
@@ -275,7 +265,9 @@ class _Link:
     def _receive(self, sample: Any, is_late: bool = False) -> None:
         """Take a frame; Zenoh calls this in its thread."""
         now_ns = self._clock.now_ns()
-        header = FrameHeader.decode(sample.attachment.to_bytes()) if sample.attachment is not None else None
+        header = (
+            wire.FrameHeader.decode(sample.attachment.to_bytes()) if sample.attachment is not None else None
+        )
         if header is None:
             return
         data = sample.payload.to_bytes()
@@ -295,15 +287,19 @@ class _Link:
 
         def receive(reply: Any) -> None:
             back_ns = self._clock.now_ns()
-            state = decode_text(NodeState, reply.ok.payload.to_bytes()) if reply.ok is not None else None
+            state = (
+                wire.decode_text(wire.NodeState, reply.ok.payload.to_bytes())
+                if reply.ok is not None
+                else None
+            )
             if state is not None:
                 self._exchanges += 1
                 self._put(0, partial(self._stream.take_state, state, sent_ns, back_ns))
 
         self._session.get(
-            state_key(self._node),
+            wire.state_key(self._node),
             _directly(receive),
-            payload=encode_text(self._stream.state_request()),
+            payload=wire.encode_text(self._stream.state_request()),
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
             priority=zenoh.Priority.INTERACTIVE_HIGH,
@@ -320,9 +316,9 @@ class _Link:
             return
         self._asks_frames = True
         self._session.get(
-            missing_key(self._node),
+            wire.missing_key(self._node),
             zenoh.handlers.Callback(self._receive_late, self._end_late),
-            payload=encode_text(request),
+            payload=wire.encode_text(request),
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
             congestion_control=zenoh.CongestionControl.BLOCK,

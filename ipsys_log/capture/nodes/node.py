@@ -8,19 +8,8 @@ from queue import Empty, Full, Queue
 from typing import Any, NamedTuple, Self
 
 from ipsys_log.capture.frames import Clock, Say
+from ipsys_log.capture.nodes import wire
 from ipsys_log.capture.nodes.network import Certificates, NodeNetwork, check_centre, open_node_session
-from ipsys_log.capture.nodes.wire import (
-    MARKERS_FORMAT,
-    FrameHeader,
-    FrameRequest,
-    NodeState,
-    StateRequest,
-    decode_text,
-    encode_text,
-    frames_key,
-    missing_key,
-    state_key,
-)
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.codec import encode
 from ipsys_log.log.growing_channel import GrowingChannel
@@ -119,8 +108,8 @@ class Node:
             reason = check_centre(self._network.host, self._network.port, self._files)
         self._checked_ns = self._clock.now_ns()
         self._session = open_node_session(self._network, self._camera)
-        self._session.declare_queryable(state_key(self._camera), self._answer_state)
-        self._session.declare_queryable(missing_key(self._camera), self._enqueue_request)
+        self._session.declare_queryable(wire.state_key(self._camera), self._answer_state)
+        self._session.declare_queryable(wire.missing_key(self._camera), self._enqueue_request)
         for thread in self._threads:
             thread.start()
         if reason is not None:
@@ -203,24 +192,24 @@ class Node:
                 frame = self._waiting.popleft()
                 self._waiting_bytes -= len(frame.data)
             self._session.put(
-                frames_key(self._camera),
+                wire.frames_key(self._camera),
                 frame.data,
                 attachment=self._header(frame),
                 congestion_control=zenoh.CongestionControl.BLOCK,
             )
 
     def _header(self, frame: _Recorded) -> bytes:
-        return FrameHeader(self.session_name, frame.number, frame.time_ns, frame.format).encode()
+        return wire.FrameHeader(self.session_name, frame.number, frame.time_ns, frame.format).encode()
 
     def _answer_state(self, query: Any) -> None:
         """Answer a request for the state; Zenoh calls this in its thread."""
         received_ns = self._clock.now_ns()
         with query:
-            request = decode_text(StateRequest, bytes(query.payload or b""))
+            request = wire.decode_text(wire.StateRequest, bytes(query.payload or b""))
             if request is None:
                 return
             self._note_centre(request, received_ns)
-            state = NodeState(
+            state = wire.NodeState(
                 self._version,
                 self.session_name,
                 received_ns,
@@ -228,9 +217,9 @@ class Node:
                 self._count,
                 self._has_ended,
             )
-            query.reply(state_key(self._camera), encode_text(state), express=True)
+            query.reply(wire.state_key(self._camera), wire.encode_text(state), express=True)
 
-    def _note_centre(self, request: StateRequest, now_ns: int) -> None:
+    def _note_centre(self, request: wire.StateRequest, now_ns: int) -> None:
         self._asked_ns = now_ns
         if request.session == self.session_name:
             if self._accepted_ns is None:
@@ -282,16 +271,16 @@ class Node:
                 self._check_later_centre()
                 continue
             with query:
-                request = decode_text(FrameRequest, bytes(query.payload or b""))
+                request = wire.decode_text(wire.FrameRequest, bytes(query.payload or b""))
                 if request is not None and request.session == self.session_name:
                     self._answer_frames(query, request)
 
-    def _answer_frames(self, query: Any, request: FrameRequest) -> None:
+    def _answer_frames(self, query: Any, request: wire.FrameRequest) -> None:
         for number in range(request.first, min(request.end, request.first + _MOST_FRAMES)):
             if number >= self._count or self._stopped.is_set():
                 return
             frame = self._find(number) or _Recorded(number, 0, "jpeg", b"")
-            query.reply(missing_key(self._camera), frame.data, attachment=self._header(frame))
+            query.reply(wire.missing_key(self._camera), frame.data, attachment=self._header(frame))
 
     def _find(self, number: int) -> _Recorded | None:
         """Return a recorded frame, from memory or from the log; None if the log does not hold it."""
@@ -308,5 +297,5 @@ class Node:
 
 def _recorded(number: int, payload: Any) -> _Recorded:
     if isinstance(payload, Markers):
-        return _Recorded(number, payload.timestamp, MARKERS_FORMAT, encode(payload))
+        return _Recorded(number, payload.timestamp, wire.MARKERS_FORMAT, encode(payload))
     return _Recorded(number, payload.timestamp, payload.format, payload.data)

@@ -9,6 +9,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from multiprocessing.connection import Connection
 from typing import Any, NamedTuple, Self
 
@@ -214,18 +215,14 @@ def _pass_on(
         while receiver.poll():
             name, clock = receiver.recv()
             opened[name] = _items_of(centre, cameras[name], clock)
-        arrived = [(name, item) for name, items in opened.items() for item in _until_none(items)]
+        arrived = [
+            (name, item)
+            for name, items in opened.items()
+            for item in iter(partial(next, items, None), None)  # at None, nothing more has arrived
+        ]
         if arrived:
             sender.send(arrived)
         time.sleep(passing_period_s(len(cameras)))
-
-
-def _until_none(items: Iterator[_Item | None]) -> Iterator[_Item]:
-    """Yield items up to the next None, at which nothing has arrived."""
-    for item in items:
-        if item is None:
-            return
-        yield item
 
 
 def _items_of(centre: Centre, camera: RigCamera, clock: Clock) -> Iterator[_Item | None]:

@@ -6,15 +6,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from ipsys_log.capture.simulation.calibration_points import (
-    SimulatedPose,
-    cameras_seeing,
-    measure,
-    place_marker,
-    plan_points,
-    reference_points,
-    split,
-)
+from ipsys_log.capture.simulation import calibration_points
 from ipsys_log.capture.simulation.cameras import Camera, FloorView, mount_cameras, prepare_view
 from ipsys_log.capture.simulation.drive import Drive, plan_drive
 from ipsys_log.capture.simulation.render import encode_jpeg, exposure_interval, render
@@ -58,7 +50,7 @@ class Instant:
     """
 
     time_ns: int
-    places: tuple[SimulatedPose, ...]
+    places: tuple[calibration_points.SimulatedPose, ...]
     prints: tuple[PlacedMarker | MovingMarker, ...]
     measured: tuple[Measurement, ...] = ()
 
@@ -111,7 +103,7 @@ def build_rig(settings: LabSettings) -> Rig:
         marker_length_m=settings.marker_length_m,
         markers=tuple(RigMarker(index, robot=f"robot_{index}") for index in range(settings.markers)),
         cameras=tuple(RigCamera(name, row_time_ns=settings.row_time_ns or None) for name in settings.cameras),
-        reference_points=reference_points(settings),
+        reference_points=calibration_points.reference_points(settings),
         floor=Floor(*settings.floor_m),
         marker_height_m=settings.drive_height_m,
         marker_height_sigma_m=ROBOT_HEIGHT_SIGMA_M,
@@ -164,15 +156,15 @@ def _photograph(
 
 
 def _instants(settings: LabSettings, cameras: Sequence[Camera]) -> Iterator[Instant]:
-    sets = plan_points(settings, cameras)
-    splits = split(sets, settings.seed)
+    sets = calibration_points.plan_points(settings, cameras)
+    splits = calibration_points.split(sets, settings.seed)
     for number, points in enumerate(sets):
         places = tuple(point.pose for point in points)
-        lying = tuple(place_marker(pose, settings) for pose in places)
+        lying = tuple(calibration_points.place_marker(pose, settings) for pose in places)
         times_ns = _times(settings, start_of_set_ns(settings, number), settings.frames_per_station)
         first = number * settings.markers
         measured = tuple(
-            measure(pose, settings, index, times_ns, splits[index])
+            calibration_points.measure(pose, settings, index, times_ns, splits[index])
             for index, pose in enumerate(places, first)
         )
         for time_ns in times_ns[:-1]:
@@ -187,7 +179,9 @@ def _instants(settings: LabSettings, cameras: Sequence[Camera]) -> Iterator[Inst
 
 def moving_marker(drive: Drive, marker_id: int, time_s: float, settings: LabSettings) -> MovingMarker:
     """Return a moving marker of the drive, for the frame at a time after the start."""
-    return lambda since_s: place_marker(drive.pose_at(marker_id, time_s + since_s), settings)
+    return lambda since_s: calibration_points.place_marker(
+        drive.pose_at(marker_id, time_s + since_s), settings
+    )
 
 
 def start_of_set_ns(settings: LabSettings, number: int) -> int:
@@ -202,7 +196,7 @@ def _times(settings: LabSettings, start_ns: int, count: int) -> list[int]:
 
 def true_tracks(
     time_ns: int,
-    places: Sequence[SimulatedPose],
+    places: Sequence[calibration_points.SimulatedPose],
     robot_of: Callable[[int], str],
     cameras: Sequence[Camera],
     settings: LabSettings,
@@ -218,7 +212,7 @@ def true_tracks(
                 y_m=pose.y_m,
                 z_m=pose.z_m,
                 heading_rad=pose.heading_rad,
-                cameras=cameras_seeing(pose, cameras, settings),
+                cameras=calibration_points.cameras_seeing(pose, cameras, settings),
             )
             for pose in places
         ),

@@ -4,8 +4,6 @@ In simulated time, messages and their order do not depend on the speed of the ma
 equal logs.
 """
 
-from __future__ import annotations
-
 import threading
 from collections import Counter, deque
 from collections.abc import Collection, Generator, Iterator
@@ -108,7 +106,7 @@ class Driver:
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._drive, name="driver", daemon=True)
 
-    def __enter__(self) -> Driver:
+    def __enter__(self) -> "Driver":
         self._thread.start()
         return self
 

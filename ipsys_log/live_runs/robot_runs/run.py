@@ -13,13 +13,7 @@ from ipsys_log.capture.simulation.robot_lab import RobotLab, robot_rig
 from ipsys_log.engine.provenance import Outcome
 from ipsys_log.engine.request import Request
 from ipsys_log.live_runs import pipeline
-from ipsys_log.live_runs.robot_runs.robot_cameras import (
-    Driver,
-    LockstepCameras,
-    RobotCameras,
-    SimulatedClock,
-    SyncPoint,
-)
+from ipsys_log.live_runs.robot_runs import robot_cameras
 from ipsys_log.live_runs.robot_runs.settings import RobotRun, start_poses
 from ipsys_log.live_runs.robot_runs.steering import Programs, Steering, start_programs
 from ipsys_log.live_runs.robot_runs.wheels import Wheels
@@ -147,10 +141,10 @@ def _lenses(lab: RobotLab) -> dict[str, CameraCalibration]:
 
 def _drive_lockstep(parts: _Parts) -> list[Outcome]:
     """Drive in simulated time."""
-    clock = SimulatedClock()
+    clock = robot_cameras.SimulatedClock()
     lab = parts.lab(clock.now_ns())
-    sync = SyncPoint(parts.topic, tuple(parts.run.paths), clock, parts.run.sends_good_only)
-    cameras = LockstepCameras(parts.run, lab, clock, sync, parts.say)
+    sync = robot_cameras.SyncPoint(parts.topic, tuple(parts.run.paths), clock, parts.run.sends_good_only)
+    cameras = robot_cameras.LockstepCameras(parts.run, lab, clock, sync, parts.say)
     with parts.connect(cameras) as (streams, wheels, programs):
         cameras.steering = Steering(parts.run, lab, wheels, programs, clock.now_ns(), parts.say)
         first = first_messages(parts.rig, _lenses(lab), cameras.now_ns)
@@ -164,7 +158,7 @@ def _drive_live(parts: _Parts) -> list[Outcome]:
     """Drive in real time."""
     clock = Clock()
     lab = parts.lab(clock.now_ns())
-    opener = RobotCameras(parts.run, lab)
+    opener = robot_cameras.RobotCameras(parts.run, lab)
     with (
         open_lab(Lab(parts.rig, parts.rig.cameras, _lenses(lab)), parts.say, clock, opener.open) as opened,
         parts.connect(opened.cameras) as (streams, wheels, programs),
@@ -173,7 +167,7 @@ def _drive_live(parts: _Parts) -> list[Outcome]:
         start_ns = clock.now_ns()
         opener.begin(cameras, start_ns)
         steering = Steering(parts.run, lab, wheels, programs, start_ns, parts.say)
-        with Driver(parts.run, cameras, steering) as driver:
+        with robot_cameras.Driver(parts.run, cameras, steering) as driver:
             outcomes = parts.live(cameras, opened.settings, streams)
         if driver.fault is not None:
             raise driver.fault

@@ -1,7 +1,5 @@
 """Control of robots: their programs and relays, one process each, and the exchange with them at each tick."""
 
-from __future__ import annotations
-
 import json
 import os
 import select
@@ -40,7 +38,7 @@ class Programs(NamedTuple):
 
     path: Path
     processes: Mapping[str, subprocess.Popen[bytes]]
-    relays: Mapping[str, RelayLink]
+    relays: "Mapping[str, RelayLink]"
 
     def check(self) -> None:
         """Check that all programs still run.

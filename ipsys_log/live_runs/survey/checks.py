@@ -8,14 +8,7 @@ from itertools import chain, count
 import numpy as np
 
 from ipsys_log.errors import IpsysError
-from ipsys_log.live_runs.survey.blunders import (
-    MODEL_NAME,
-    floor_sigma_m,
-    warn_crossing,
-    warn_floor,
-    warn_model,
-    warn_tapes,
-)
+from ipsys_log.live_runs.survey import blunders
 from ipsys_log.live_runs.survey.entry import Entry, Fault, check_references, parse_baseline
 from ipsys_log.live_runs.survey.scene import MarkerObservations, Prediction, predict
 from ipsys_log.messages import Array, Distance, Measurement, Model, Rig
@@ -110,7 +103,7 @@ def check_entry(
     observations: MarkerObservations | None,
     history: Sequence[Measurement],
     model: Model | None = None,
-    model_name: str = MODEL_NAME,
+    model_name: str = blunders.MODEL_NAME,
 ) -> EntryCheck:
     """Check whether an entry is plausible, and create its measurement.
 
@@ -146,20 +139,20 @@ def check_entry(
     except IpsysError as error:
         reason = "; ".join([_without_id(error, name), *entry.doubts])
         return EntryCheck(name, (*all_faults, Fault("", reason)))
-    on_floor, remark = warn_floor(read, fixed, rig)
-    flat = warn_crossing(read, rig)
-    warnings += [*remark, *warn_tapes(read, fixed, rig), *flat]
+    on_floor, remark = blunders.warn_floor(read, fixed, rig)
+    flat = blunders.warn_crossing(read, rig)
+    warnings += [*remark, *blunders.warn_tapes(read, fixed, rig), *flat]
     earlier = _here_before(read, observations, history)
     all_faults += _twin_faults(read, earlier)
     warnings += _repeat_warnings(read, fixed, rig, earlier) if read.still else []
     predictions = predict(model, observations.points_m, fixed.world_m) if model and observations else ()
-    warnings += warn_model(read, fixed, rig, predictions, model_name)
+    warnings += blunders.warn_model(read, fixed, rig, predictions, model_name)
     return EntryCheck(
         name,
         tuple(all_faults),
         tuple(dict.fromkeys(warnings)),
         fixed.world_m,
-        floor_sigma_m(fixed),
+        blunders.floor_sigma_m(fixed),
         _residuals(read, fixed),
         on_floor,
         predictions,

@@ -1,7 +1,5 @@
 """Reading of logs for the drift of their cameras, with the checks of the input."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -99,7 +97,7 @@ def _order(paths: Sequence[LogLocation], baseline: LogLocation | None) -> tuple[
 
 def _read_logs(
     paths: Sequence[LogLocation], rig: Rig | None, progress: Callable[[int, int], None], remarks: list[str]
-) -> list[_Log]:
+) -> "list[_Log]":
     """Return the logs with reference markers, the baseline first; add remarks on the others."""
     logs: list[_Log] = []
     for number, path in enumerate(paths):

@@ -172,8 +172,8 @@ def _plan_corner_model(
     expected = expect_on_floor(models, sizes_px, grid, height_m, side_m)
     candidates_m = _candidates(rig, low_m, high_m, _COARSE * grid.step_m, side_m / 2, heights_m or [0.0])
     tape_m2 = _tape_covariances(session, rig)
-    plan = plan_joint_points(models, sizes_px, expected, candidates_m, tape_m2, side_m, count, progress)
-    drive = choose_drive(models, sizes_px, expected, low_m, high_m, height_m, side_m)
+    plan = plan_joint_points(expected, candidates_m, tape_m2, count, progress)
+    drive = choose_drive(expected, low_m, high_m, height_m)
     notes = tuple(_joint_notes(rig, {*models}))
     return PlannedFloor(model.name, run, rig, plan, grid.xs_m, grid.ys_m, height_m, measured_m, notes, drive)
 

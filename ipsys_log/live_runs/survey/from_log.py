@@ -1,7 +1,5 @@
 """Measuring in a finished log: stationary intervals, measurements at their time, excluded measurements."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -52,7 +50,7 @@ def open_finished_log(
     request: Request,
     progress: Progress = lambda stage, done, total: None,
     say: Callable[[str], None] = lambda text: None,
-) -> Iterator[FinishedLog]:
+) -> "Iterator[FinishedLog]":
     """Open a log for measuring; missing markers and camera points are computed and appended first.
 
     Parameters

@@ -16,15 +16,8 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages import Array, CameraCalibration, Rig
 from ipsys_log.messages.channels import CAMERA_POINTS, MARKERS, MODEL, Channel
 from ipsys_log.messages.stage import Progress
+from ipsys_log.statistics import expected_error
 from ipsys_log.statistics.calibration_points import measured, split_ids
-from ipsys_log.statistics.expected_error import (
-    ExpectedErrors,
-    FloorGap,
-    TapedPoint,
-    choose_points,
-    expect_errors,
-    find_floor_gaps,
-)
 from ipsys_log.statistics.floor_cameras import FloorGrid
 from ipsys_log.statistics.joint_evaluation import fit_without, is_nominal, observe
 from ipsys_log.statistics.marker_tests import find_contradicted_inputs
@@ -61,11 +54,11 @@ class CameraResult:
     row_time_s : the estimated time between two rows, in s; None if the rig has it.
     """
 
-    expected: ExpectedErrors
+    expected: expected_error.ExpectedErrors
     sightings: tuple[int, int]
     rmse_px: float
     covered: float
-    gaps: tuple[FloorGap, ...]
+    gaps: tuple[expected_error.FloorGap, ...]
     places_m: Array
     clock_s: float | None
     nominal: bool
@@ -118,8 +111,8 @@ class LabCalibration:
     grid: FloorGrid
     height_m: float
     points_m: Array
-    points: tuple[TapedPoint, ...]
-    gap: FloorGap | None
+    points: tuple[expected_error.TapedPoint, ...]
+    gap: expected_error.FloorGap | None
     faults: tuple[Finding, ...]
     ignored: int
     missing: tuple[str, ...]
@@ -216,7 +209,7 @@ def describe_fit(
     step_m = 0.1 * max(1, round(float((high_m - low_m).max()) / _SPAN_M))
     grid = FloorGrid.over(low_m, high_m, step_m)
     height_m, length_m = _usual_marker(rig, fit)
-    expected = expect_errors(models, sizes_px, grid, height_m, length_m)
+    expected = expected_error.expect_errors(models, sizes_px, grid, height_m, length_m)
     if not any(len(one.errors_m) for one in expected):
         raise IpsysError(
             f"no camera sees a whole marker {height_m:g} m above the floor; correct the floor and the "
@@ -235,14 +228,11 @@ def describe_fit(
         for number, one in enumerate(expected)
     )
     gap = _choose_gap(cameras, goal_m)
-    taped = choose_points(
-        models,
-        sizes_px,
+    taped = expected_error.choose_points(
         expected,
         _candidates(rig, low_m, high_m, step_m),
         # Another reading has the same scale: it tells nothing of the part of the error by the scale.
         expected_tape_covariances(rig, scale_sigma=fit.observations.tape.scale_sigma),
-        length_m,
         goal_m if max(c.mean_m for c in cameras if len(c.expected.errors_m)) > goal_m else np.inf,
         _MOST_POINTS if len(rig.reference_points) > 1 else 0,
     )
@@ -348,7 +338,7 @@ def _usual_marker(rig: Rig, fit: JointFit) -> tuple[float, float]:
 def _describe_camera(
     fit: JointFit,
     number: int,
-    expected: ExpectedErrors,
+    expected: expected_error.ExpectedErrors,
     grid: FloorGrid,
     places_m: Array,
     clock_s: float,
@@ -356,7 +346,7 @@ def _describe_camera(
 ) -> CameraResult:
     sightings = fit.observations.sightings[number]
     moving = int((sightings.point < 0).sum())
-    covered, gaps = find_floor_gaps(expected, grid, places_m)
+    covered, gaps = expected_error.find_floor_gaps(expected, grid, places_m)
     counts = len(sightings) - moving, moving
     return CameraResult(
         expected,
@@ -393,7 +383,7 @@ def _rmse_px(fit: JointFit, camera: int) -> float:
     return float(np.sqrt(values.mean())) if len(values) else float("nan")
 
 
-def _choose_gap(cameras: Sequence[CameraResult], goal_m: float) -> FloorGap | None:
+def _choose_gap(cameras: Sequence[CameraResult], goal_m: float) -> expected_error.FloorGap | None:
     """Return the gap that costs most: area times expected error."""
     worth = [
         gap for camera in cameras for gap in camera.gaps if gap.error_m > max(goal_m, _WORSE * camera.mean_m)

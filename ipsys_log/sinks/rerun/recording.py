@@ -1,7 +1,5 @@
 """The Rerun recording of a log: images with markers, floor, positions and tracks, and time series."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,17 +13,8 @@ from ipsys_log.log.dataset import Session
 from ipsys_log.messages import MEASUREMENTS_TOPIC, TRUTH_TOPIC
 from ipsys_log.messages.channels import LATENCY, MEASUREMENTS
 from ipsys_log.sinks.colours import camera_colours, robot_colour
+from ipsys_log.sinks.rerun import scene
 from ipsys_log.sinks.rerun.messages import RerunSink, trail_entity
-from ipsys_log.sinks.rerun.scene import (
-    TIMELINES,
-    Plot,
-    draw_legend,
-    draw_places,
-    draw_rig,
-    layout,
-    open_recording,
-    symbol_scale,
-)
 from ipsys_log.sinks.rerun.viewer import show_in_viewer
 from ipsys_log.sinks.selection import Shown, choose_runs, fade_ns, rig_in_force
 from ipsys_log.statistics.calibration_points import locate_measurements
@@ -87,7 +76,7 @@ def _name_of(session: Session) -> str:
 
 
 def _save(session: Session, shown: Shown, path: Path) -> None:
-    with open_recording(_name_of(session)) as recording:
+    with scene.open_recording(_name_of(session)) as recording:
         try:
             recording.save(path)
         except RuntimeError as error:
@@ -96,7 +85,7 @@ def _save(session: Session, shown: Shown, path: Path) -> None:
 
 
 def _stream(session: Session, shown: Shown, write: Callable[[bytes], object]) -> None:
-    with open_recording(_name_of(session)) as recording:
+    with scene.open_recording(_name_of(session)) as recording:
         stream = rr.binary_stream(recording)
         _draw(session, shown, recording, lambda: write(stream.read() or b""))
 
@@ -110,15 +99,15 @@ def _draw(session: Session, shown: Shown, recording: rr.RecordingStream, sent: C
     series = read_series(session, shown.runs)
     sizes_px = _sizes_px(session, shown.cameras)
     has_events = bool(shown.events or faults)
-    recording.send_blueprint(layout(shown.cameras, trails, rig, has_events, _plots(series), sizes_px))
-    draw_rig(recording, rig)
-    draw_places(recording, places, symbol_scale(rig))
-    draw_legend(recording)
+    recording.send_blueprint(scene.layout(shown.cameras, trails, rig, has_events, _plots(series), sizes_px))
+    scene.draw_rig(recording, rig)
+    scene.draw_places(recording, places, scene.symbol_scale(rig))
+    scene.draw_legend(recording)
     draw_series(recording, series)
     for fault in faults:
         recording.log("events/measurements", rr.TextLog(fault, level="WARN"))
     fades = fade_ns(session, shown.frames, _FRAME_FACTOR) | fade_ns(session, shown.moving)
-    sink = RerunSink(recording, (*shown.cameras, *shown.others), fades, shown.runs, symbol_scale(rig))
+    sink = RerunSink(recording, (*shown.cameras, *shown.others), fades, shown.runs, scene.symbol_scale(rig))
     for number, message in enumerate(session.messages([*shown.frames, *shown.moving, *shown.events])):
         sink(message)
         if number % _BATCH == 0:
@@ -128,9 +117,9 @@ def _draw(session: Session, shown: Shown, recording: rr.RecordingStream, sent: C
     sent()
 
 
-def _plots(series: Sequence[Series]) -> dict[str, Plot]:
-    counts = {entity: sum(one.is_below(entity) for one in series) for entity in _PLOTS}
-    return {entity: Plot(title, counts[entity]) for entity, title in _PLOTS.items() if counts[entity]}
+def _plots(series: "Sequence[Series]") -> dict[str, scene.Plot]:
+    counts = {entity: sum(one.entity.startswith(f"{entity}/") for one in series) for entity in _PLOTS}
+    return {entity: scene.Plot(title, counts[entity]) for entity, title in _PLOTS.items() if counts[entity]}
 
 
 def _sizes_px(session: Session, cameras: Sequence[str]) -> dict[str, tuple[int, int]]:
@@ -155,10 +144,6 @@ class Series:
     colour: tuple[int, int, int]
     times_ns: Mapping[str, NDArray[np.int64]]
     values: NDArray[np.float64]
-
-    def is_below(self, entity: str) -> bool:
-        """Return whether the series belongs to the plot of an entity."""
-        return self.entity.startswith(f"{entity}/")
 
 
 def read_series(session: Session, runs: Sequence[str]) -> list[Series]:
@@ -191,7 +176,7 @@ def _disagreements(session: Session, run: str, several: bool) -> Iterator[Series
     for number, pair in enumerate(read_disagreement(session, run, reference_ids(session))):
         name = " - ".join(pair.cameras) + (f" ({run})" if several else "")
         entity = f"{DISAGREEMENT}/{run}/{'_and_'.join(pair.cameras)}"
-        times_ns = {TIMELINES[0]: pair.times_ns}
+        times_ns = {scene.TIMELINES[0]: pair.times_ns}
         yield Series(entity, name, robot_colour(number), times_ns, _MM_PER_M * pair.lengths_m)
 
 
@@ -204,7 +189,7 @@ def _latencies(session: Session) -> Iterator[Series]:
         stamps = ([m.publish_time_ns for m in own], [m.log_time_ns for m in own])
         times_ns = {
             timeline: np.array(column, dtype=np.int64)
-            for timeline, column in zip(TIMELINES, stamps, strict=True)
+            for timeline, column in zip(scene.TIMELINES, stamps, strict=True)
         }
         delays_ns = np.array([m.payload.published - m.payload.received for m in own], dtype=np.float64)
         yield Series(f"{LATENCY_MS}/{camera}", camera, colour, times_ns, delays_ns / _NS_PER_MS)

@@ -4,8 +4,6 @@ A setting has its option of the command line. This module loads no stream, so th
 appears at once; :mod:`ipsys_log.sinks.streams.opening` loads a stream if its setting is given.
 """
 
-from __future__ import annotations
-
 import secrets
 from dataclasses import dataclass, field
 from math import pi

@@ -4,14 +4,12 @@ The server of ``foxglove-sdk`` accepts every Origin and Host. In front of it, a 
 page in a browser reaches its port. So this server speaks the protocol itself and checks each connection.
 """
 
-from __future__ import annotations
-
 import asyncio
 import hmac
 import http
 import logging
 import threading
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
@@ -24,20 +22,10 @@ from websockets.typing import Subprotocol
 from ipsys_log.log.codec import PAYLOADS, encode
 from ipsys_log.messages import CameraCalibration, Message, Rig, SkippedVideo, Tracks
 from ipsys_log.messages.channels import IMAGES
-from ipsys_log.sinks.sink import DropReport, Warn
+from ipsys_log.sinks.sink import DropReport
+from ipsys_log.sinks.streams import foxglove_messages
 from ipsys_log.sinks.streams.addresses import LOOPBACK, is_loopback, is_own_host, listen
-from ipsys_log.sinks.streams.foxglove_messages import (
-    SUBPROTOCOLS,
-    Advertised,
-    Subscriptions,
-    pack_message,
-    pack_time,
-    write_advertise,
-    write_server_info,
-    write_status,
-)
 from ipsys_log.sinks.streams.poses import NewSession, StreamContext
-from ipsys_log.statistics.latency import PositionMonitor
 
 _BACKLOG = 16
 _MOST_CLIENTS = 32
@@ -67,13 +55,8 @@ class FoxgloveStream:
     Parameters
     ----------
     port : the port; 0 means any free port.
-    host : the address of this machine to listen on; None: only this machine.
-    secret : the token in the address.
-    session : the number of the session.
-    topics : the topics of the tracks, announced before the first message.
-    with_images : send images, too.
-    is_replayed : the times are those of a recording; clients get them as the time of the server.
-    positions : clients get a status if the positions of a live run are late or stale.
+    context : the inputs of all streams. Its topics are announced before the first message. Clients get the
+        times of a recording as the time of the server, and a status if live positions are late or stale.
 
     Raises
     ------
@@ -81,34 +64,25 @@ class FoxgloveStream:
         The port is in use or not allowed, or the host is not this machine.
     """
 
-    def __init__(
-        self,
-        port: int,
-        host: str | None,
-        secret: str,
-        session: int,
-        topics: Collection[str],
-        warn: Warn,
-        with_images: bool = False,
-        is_replayed: bool = False,
-        positions: PositionMonitor | None = None,
-    ) -> None:
-        self._positions, self._status = positions, ""
+    def __init__(self, port: int, context: StreamContext) -> None:
+        settings, with_images, warn = context.settings, context.settings.images, context.warn
+        self._positions, self._status = context.positions, ""
         images = (*IMAGES.payloads, SkippedVideo)
         shown = {payload for payload in PAYLOADS.values() if with_images or payload not in images}
         self.payloads: tuple[type, ...] = (*shown, NewSession, *(images if with_images else ()))
-        self._host, self._secret, self._session = host or LOOPBACK, secret, session
-        self._warn, self._is_replayed, self._time_ns = warn, is_replayed, -1
+        self._host, self._secret = settings.host or LOOPBACK, settings.secret
+        self._session, self._warn = context.session, warn
+        self._is_replayed, self._time_ns = context.is_replayed, -1
         self._listening = listen(self._host, port, "--foxglove", _BACKLOG)
         self.port: int = self._listening.getsockname()[1]
         self.name = f"Foxglove port {self.port}"
         self.drops, self._refusals = DropReport(self.name, warn), 0
-        self._channels: dict[str, Advertised] = {}
+        self._channels: dict[str, foxglove_messages.Advertised] = {}
         self._latched: dict[str, tuple[int, bytes]] = {}
         # Replaced as a whole: other threads iterate over it.
         self._clients: frozenset[Client] = frozenset()
         self._waiting: list[ServerConnection] = []  # the oldest first
-        for topic in topics:
+        for topic in context.topics:
             self._advertise(topic, Tracks)
         self._loop = asyncio.new_event_loop()
         self._ended = asyncio.Event()
@@ -140,7 +114,7 @@ class FoxgloveStream:
         elif self._is_replayed:
             self._call(self._send_time, time_ns)
 
-    def _is_wanted(self, channel: Advertised) -> bool:
+    def _is_wanted(self, channel: foxglove_messages.Advertised) -> bool:
         """Return whether a client has subscribed to a channel; any thread may call this."""
         return any(client.subscriptions.number_of(channel.number) is not None for client in self._clients)
 
@@ -167,7 +141,7 @@ class FoxgloveStream:
             backlog=_BACKLOG,
             process_request=self._check,
             create_connection=self._connect,  # type: ignore[arg-type]  # only called, never subclassed
-            subprotocols=[Subprotocol(name) for name in SUBPROTOCOLS],
+            subprotocols=[Subprotocol(name) for name in foxglove_messages.SUBPROTOCOLS],
             max_size=_LARGEST_MESSAGE,
             compression=None,
             server_header=None,
@@ -207,9 +181,11 @@ class FoxgloveStream:
                 connection, name, "has not the secret; use the full address that ipsys printed"
             )
         offered = ",".join(headers.get_all("Sec-WebSocket-Protocol")).replace(" ", "").split(",")
-        if not set(SUBPROTOCOLS) & set(offered):
+        if not set(foxglove_messages.SUBPROTOCOLS) & set(offered):
             return self._refuse(
-                connection, name, f"does not speak {SUBPROTOCOLS[0]}; use a newer version of Foxglove"
+                connection,
+                name,
+                f"does not speak {foxglove_messages.SUBPROTOCOLS[0]}; use a newer version of Foxglove",
             )
         if len(self._clients) >= _MOST_CLIENTS:
             return self._refuse(connection, name, f"is too much: there are {_MOST_CLIENTS} clients already")
@@ -224,10 +200,10 @@ class FoxgloveStream:
     async def _handle(self, connection: ServerConnection) -> None:
         self._waiting = [other for other in self._waiting if other is not connection]
         client = Client(connection, self.drops)
-        client.put(write_server_info("ipsys", self._session, self._is_replayed))
-        client.put(write_advertise(list(self._channels.values())))
+        client.put(foxglove_messages.write_server_info("ipsys", self._session, self._is_replayed))
+        client.put(foxglove_messages.write_advertise(list(self._channels.values())))
         if self._status:
-            client.put(write_status(self._status))
+            client.put(foxglove_messages.write_status(self._status))
         self._clients |= {client}
         try:
             async for text in connection:
@@ -237,7 +213,7 @@ class FoxgloveStream:
         finally:
             self._clients -= {client}
 
-    def _subscribe(self, client: Client, text: str | bytes) -> None:
+    def _subscribe(self, client: "Client", text: str | bytes) -> None:
         """Read a message of a client; a new subscriber gets the last message of latched types."""
         if isinstance(text, bytes):
             raise ValueError("a client cannot publish")
@@ -256,12 +232,14 @@ class FoxgloveStream:
         for client in self._clients:
             client.put_message(channel.number, time_ns, data, payload in IMAGES.payloads)
 
-    def _advertise(self, topic: str, payload: type) -> Advertised | None:
+    def _advertise(self, topic: str, payload: type) -> foxglove_messages.Advertised | None:
         if len(self._channels) >= _MOST_CHANNELS:
             return None
-        channel = self._channels[topic] = Advertised(len(self._channels) + 1, topic, payload)
+        channel = self._channels[topic] = foxglove_messages.Advertised(
+            len(self._channels) + 1, topic, payload
+        )
         for client in self._clients:
-            client.put(write_advertise([channel]))
+            client.put(foxglove_messages.write_advertise([channel]))
         return channel
 
     def _begin(self, session: int, time_ns: int) -> None:
@@ -278,13 +256,13 @@ class FoxgloveStream:
         if text != self._status:
             self._status = text
             for client in self._clients:
-                client.put(write_status(text))
+                client.put(foxglove_messages.write_status(text))
 
     def _send_time(self, time_ns: int) -> None:
         if self._is_replayed and time_ns != self._time_ns:
             self._time_ns = time_ns
             for client in self._clients:
-                client.put(pack_time(time_ns))
+                client.put(foxglove_messages.pack_time(time_ns))
 
 
 class Client:
@@ -296,14 +274,14 @@ class Client:
     """
 
     def __init__(self, connection: ServerConnection, drops: DropReport) -> None:
-        self.subscriptions = Subscriptions()
+        self.subscriptions = foxglove_messages.Subscriptions()
         self._connection, self.drops = connection, drops
 
     def put_message(self, channel: int, time_ns: int, data: bytes, is_image: bool) -> None:
         """Send a message of a channel if the client has subscribed to it."""
         number = self.subscriptions.number_of(channel)
         if number is not None:
-            self.put(pack_message(number, time_ns, data), is_image)
+            self.put(foxglove_messages.pack_message(number, time_ns, data), is_image)
 
     def put(self, data: str | bytes, is_image: bool = False) -> None:
         """Send data, or drop it if too much waits; this never blocks."""
@@ -322,8 +300,5 @@ def _is_closed(connection: ServerConnection) -> bool:
 
 def open_all(context: StreamContext) -> Iterator[FoxgloveStream]:
     """Yield the server, if there is one."""
-    settings = context.settings
-    if settings.foxglove is not None:
-        where = settings.foxglove, settings.host, settings.secret
-        inputs = context.session, context.topics, context.warn
-        yield FoxgloveStream(*where, *inputs, settings.images, context.is_replayed, context.positions)
+    if context.settings.foxglove is not None:
+        yield FoxgloveStream(context.settings.foxglove, context)

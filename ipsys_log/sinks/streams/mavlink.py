@@ -4,8 +4,6 @@ The autopilots PX4 and ArduPilot expect x forward (here: north), y right (east) 
 clockwise from north, seen from above. docs/streams.md lists what each autopilot does with each field.
 """
 
-from __future__ import annotations
-
 import select
 import threading
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """The streams of a command: their settings in a rig file, their check before any work, and their opening."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
 from dataclasses import fields, replace

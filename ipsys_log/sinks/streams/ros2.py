@@ -2,7 +2,7 @@
 
 import socket
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import zenoh
@@ -10,10 +10,10 @@ import zenoh
 from ipsys_log.capture.frames import Clock
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Message, Tracks
-from ipsys_log.sinks.sink import DropReport, Warn
+from ipsys_log.sinks.sink import DropReport
 from ipsys_log.sinks.streams import ros2_messages as ros2
 from ipsys_log.sinks.streams.addresses import LOOPBACK, is_loopback, listen
-from ipsys_log.sinks.streams.poses import NewSession, PoseSource, StreamContext, StreamPose
+from ipsys_log.sinks.streams.poses import NewSession, StreamContext, StreamPose
 from ipsys_log.sinks.streams.rmw_zenoh import Entity, Publisher, Qos, configure
 from ipsys_log.sinks.streams.ros2_messages import is_stampable, type_hash
 
@@ -35,12 +35,7 @@ class Ros2Stream:
     Parameters
     ----------
     port : the port of the router, usually 7447.
-    domain : the domain ID of ROS 2.
-    host : the address of this machine to listen on; None: only this machine.
-    poses : gives the poses of a message.
-    now_ns : the clock of the capture times.
-    heights_m : the robots of the rig, with the heights of their markers above the floor (None: unknown).
-    is_replayed : the times are those of a recording; the stream sends them as ``/clock``.
+    context : the inputs of all streams; the times of a recording are sent as ``/clock``.
 
     Raises
     ------
@@ -50,25 +45,17 @@ class Ros2Stream:
 
     payloads: tuple[type, ...] = (Tracks, NewSession)
 
-    def __init__(
-        self,
-        port: int,
-        domain: int,
-        host: str | None,
-        poses: PoseSource,
-        now_ns: Callable[[], int],
-        warn: Warn,
-        heights_m: Mapping[str, float | None],
-        is_replayed: bool = False,
-    ) -> None:
+    def __init__(self, port: int, context: StreamContext) -> None:
+        domain, host = context.settings.ros2_domain, context.settings.host
         if not 0 <= domain <= _MOST_DOMAIN:
             raise IpsysError(f"--ros2-domain {domain}: give a domain ID from 0 to {_MOST_DOMAIN}")
         self.port, self._host, self._domain = port, host or LOOPBACK, domain
         self.name = f"ROS 2 domain {domain}"
-        self._poses, self._now_ns, self._clock = poses, now_ns, Clock()
-        self.drops = DropReport(self.name, warn)
+        self._poses, self._now_ns, self._clock = context.poses(), context.now_ns, Clock()
+        self.drops = DropReport(self.name, context.warn)
+        heights_m = context.streamed_heights_m
         self._newest: dict[str, StreamPose | None] = dict.fromkeys(heights_m)
-        self._is_replayed = is_replayed
+        self._is_replayed = context.is_replayed
         self._ended = threading.Event()
         self.is_router = not _answers(port)
         self._session = _open_session(domain, port, host, self.is_router)
@@ -198,8 +185,5 @@ def _has_other(session: zenoh.Session) -> bool:
 
 def open_all(context: StreamContext) -> Iterator[Ros2Stream]:
     """Yield the node, if there is one."""
-    settings, heights_m = context.settings, context.streamed_heights_m
-    if settings.ros2 is not None:
-        where = settings.ros2, settings.ros2_domain, settings.host
-        inputs = context.poses(), context.now_ns, context.warn
-        yield Ros2Stream(*where, *inputs, heights_m, context.is_replayed)
+    if context.settings.ros2 is not None:
+        yield Ros2Stream(context.settings.ros2, context)

@@ -1,35 +1,19 @@
 """VRPN server and its clients: a tracker per robot, as a motion-capture system has. It sends only."""
 
-from __future__ import annotations
-
 import errno
 import selectors
 import socket
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 
 from ipsys_log.capture.frames import Clock
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Message, Tracks
-from ipsys_log.sinks.sink import DropReport, Warn
+from ipsys_log.sinks.sink import DropReport
+from ipsys_log.sinks.streams import vrpn_messages
 from ipsys_log.sinks.streams.addresses import LOOPBACK, is_loopback, refuse_bind
-from ipsys_log.sinks.streams.poses import NewSession, PoseSource, StreamContext, StreamPose
-from ipsys_log.sinks.streams.vrpn_messages import (
-    DISCONNECT,
-    GREETING,
-    GREETING_BYTES,
-    PING,
-    PONG,
-    SENDER_DESCRIPTION,
-    TYPE_DESCRIPTION,
-    TYPES,
-    describe,
-    is_greeting,
-    pack,
-    pack_pose,
-    take_message,
-)
+from ipsys_log.sinks.streams.poses import NewSession, StreamContext, StreamPose
 from ipsys_log.units import NS_PER_S
 
 _MOST_CLIENTS, _MOST_CALLBACKS = 32, 4
@@ -52,9 +36,7 @@ class VrpnStream:
     Parameters
     ----------
     port : the port; 0 means any free port.
-    host : the address of this machine to listen on; None: only this machine.
-    poses : gives the poses of a message.
-    robots : the robots that are announced before they are seen.
+    context : the inputs of all streams; its robots are announced before they are seen.
 
     Raises
     ------
@@ -64,20 +46,19 @@ class VrpnStream:
 
     payloads: tuple[type, ...] = (Tracks, NewSession)
 
-    def __init__(
-        self, port: int, host: str | None, poses: PoseSource, warn: Warn, robots: Sequence[str] = ()
-    ) -> None:
-        self._host, self._poses, self._warn = host or LOOPBACK, poses, warn
+    def __init__(self, port: int, context: StreamContext) -> None:
+        self._host, self._poses = context.settings.host or LOOPBACK, context.poses()
+        self._warn = context.warn
         self._listening, self._asking = _listen(self._host, port)
         self.port: int = self._listening.getsockname()[1]
         self.name = f"VRPN port {self.port}"
-        self.drops, self._refusals = DropReport(self.name, warn), 0
+        self.drops, self._refusals = DropReport(self.name, context.warn), 0
         self._clock = Clock()
         # The lock guards the clients and the robots; no call within it waits.
         self._lock = threading.Lock()
         self._clients: list[Client] = []
         self._robots: dict[bytes, int] = {}
-        for robot in robots:
+        for robot in context.streamed_heights_m:
             self._sender(robot)
         self._wake, self._woken = socket.socketpair()
         self._wake.setblocking(False)
@@ -118,7 +99,9 @@ class VrpnStream:
             if sender is None:
                 return
             for client in self._clients:
-                if client.is_greeted and not client.send(pack_pose(pose, sender, client.count(2))):
+                if client.is_greeted and not client.send(
+                    vrpn_messages.pack_pose(pose, sender, client.count(2))
+                ):
                     self.drops.add(f"client {client.name} is too slow")
             waiting = any(client.has_output for client in self._clients)
         if waiting:
@@ -133,7 +116,7 @@ class VrpnStream:
             number = self._robots[name] = len(self._robots)
             for client in self._clients:
                 if client.is_greeted:
-                    client.send(describe(name, number, True, client.count(1)), always=True)
+                    client.send(vrpn_messages.describe(name, number, True, client.count(1)), always=True)
         return self._robots[name]
 
     def _wake_thread(self) -> None:
@@ -162,7 +145,7 @@ class VrpnStream:
         for client in self._clients:
             client.close()
 
-    def _handle(self, client: Client, events: int) -> None:
+    def _handle(self, client: "Client", events: int) -> None:
         with self._lock:
             fault = client.handle(events, self._robots)
         if fault is not None:
@@ -207,7 +190,7 @@ class VrpnStream:
         with self._lock:
             self._clients = [*self._clients, client]
 
-    def _remove(self, client: Client, reason: str) -> None:
+    def _remove(self, client: "Client", reason: str) -> None:
         with self._lock:
             self._clients = [other for other in self._clients if other is not client]
         client.close()
@@ -247,9 +230,8 @@ def _listen(host: str, port: int) -> tuple[socket.socket, socket.socket]:
 
 def open_all(context: StreamContext) -> Iterator[VrpnStream]:
     """Yield the server, if there is one."""
-    settings, robots = context.settings, list(context.streamed_heights_m)
-    if settings.vrpn is not None:
-        yield VrpnStream(settings.vrpn, settings.host, context.poses(), context.warn, robots)
+    if context.settings.vrpn is not None:
+        yield VrpnStream(context.settings.vrpn, context)
 
 
 # About 200 poses with velocities: a client that is so far behind loses further ones.
@@ -277,7 +259,7 @@ class Client:
         self.socket, self.name, self.greeting_until_ns = sock, name, greeting_until_ns
         self.is_greeted = False
         self._is_connected = is_connected
-        self._input, self._output = bytearray(), bytearray(GREETING)
+        self._input, self._output = bytearray(), bytearray(vrpn_messages.GREETING)
         self._count = 0
         # Names that the client gave to its own numbers.
         self._senders: dict[int, bytes] = {}
@@ -355,29 +337,29 @@ class Client:
     def _read(self, robots: Mapping[bytes, int]) -> str | None:
         """Read the messages that have arrived; return the reason of an end."""
         if not self.is_greeted:
-            if len(self._input) < GREETING_BYTES:
+            if len(self._input) < vrpn_messages.GREETING_BYTES:
                 return None
-            if not is_greeting(bytes(self._input[:GREETING_BYTES])):
+            if not vrpn_messages.is_greeting(bytes(self._input[: vrpn_messages.GREETING_BYTES])):
                 return "has another version of VRPN; this server has 07.38"
-            del self._input[:GREETING_BYTES]
+            del self._input[: vrpn_messages.GREETING_BYTES]
             self._introduce(robots)
-        while (message := take_message(self._input)) is not None:
-            if message.type == DISCONNECT:
+        while (message := vrpn_messages.take_message(self._input)) is not None:
+            if message.type == vrpn_messages.DISCONNECT:
                 return ""
-            if message.type in (SENDER_DESCRIPTION, TYPE_DESCRIPTION):
-                names = self._senders if message.type == SENDER_DESCRIPTION else self._types
+            if message.type in (vrpn_messages.SENDER_DESCRIPTION, vrpn_messages.TYPE_DESCRIPTION):
+                names = self._senders if message.type == vrpn_messages.SENDER_DESCRIPTION else self._types
                 if len(names) < _MOST_NAMES:
                     names[message.sender] = message.name
-            elif self._types.get(message.type) == TYPES[PING]:
+            elif self._types.get(message.type) == vrpn_messages.TYPES[vrpn_messages.PING]:
                 robot = robots.get(self._senders.get(message.sender, b""))
                 if robot is not None:
-                    self.send(pack(b"", PONG, robot, 0, self.count(1)))
+                    self.send(vrpn_messages.pack(b"", vrpn_messages.PONG, robot, 0, self.count(1)))
         return None
 
     def _introduce(self, robots: Mapping[bytes, int]) -> None:
         """Describe the senders and types of this server."""
         self.is_greeted = True
         for name, number in robots.items():
-            self.send(describe(name, number, True, self.count(1)), always=True)
-        for number, name in enumerate(TYPES):
-            self.send(describe(name, number, False, self.count(1)), always=True)
+            self.send(vrpn_messages.describe(name, number, True, self.count(1)), always=True)
+        for number, name in enumerate(vrpn_messages.TYPES):
+            self.send(vrpn_messages.describe(name, number, False, self.count(1)), always=True)

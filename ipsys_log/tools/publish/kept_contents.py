@@ -16,7 +16,7 @@ from ipsys_log.engine.request import Progress
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.contents import camera_of_topic, run_of_topic
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import CompressedImage, Grey, Message, RawImage, Run
+from ipsys_log.messages import CompressedImage, Grey, Message, RawImage
 from ipsys_log.messages.channels import CHANNELS, CUTS, MARKERS, MEASUREMENTS, RECORD
 from ipsys_log.plain_text import shell_words
 from ipsys_log.tools.cut_selection import CutOptions
@@ -33,7 +33,8 @@ def kept_channels(session: Session, without_images: bool) -> set[str]:
     IpsysError
         The images are left out, and no markers are detected yet.
     """
-    kept = {topic for run in session.runs() if _is_imported(run) for topic in _topics(session, run.run)}
+    imported = [run.run for run in session.runs() if stage_named(run.stage) is None]
+    kept = {topic for run in imported for topic in _topics(session, run)}
     if session.images and not without_images:
         return kept
     run_name = newest_run(session, MARKERS)
@@ -45,10 +46,6 @@ def kept_channels(session: Session, without_images: bool) -> set[str]:
             f"ipsys replay --until detect {shell_words(*session.paths)}"
         )
     return kept
-
-
-def _is_imported(run: Run) -> bool:
-    return stage_named(run.stage) is None
 
 
 def _topics(session: Session, run: str) -> set[str]:

@@ -3,8 +3,6 @@
 All files of the folder or the zip archive are listed and checked before one is read.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import re
@@ -84,7 +82,7 @@ def copy_pack(path: Path, folder: Path) -> OpenedPack:
     return OpenedPack(manifest, stated, tuple(folder / name for name in manifest.logs))
 
 
-def _read_text(files: _PackFiles, name: str) -> bytes:
+def _read_text(files: "_PackFiles", name: str) -> bytes:
     if files.sizes[name] > LARGEST_TEXT:
         raise IpsysError(
             f"{files.where}: {name} has {format_bytes(files.sizes[name])}, more than a pack "
@@ -94,7 +92,7 @@ def _read_text(files: _PackFiles, name: str) -> bytes:
         return file.read(LARGEST_TEXT)
 
 
-def _check_list(files: _PackFiles, manifest: Manifest) -> None:
+def _check_list(files: "_PackFiles", manifest: Manifest) -> None:
     named = {member.name: member.size for member in manifest.members}
     expected = {*named, MANIFEST, CHECKSUMS}
     if missing := sorted(expected - set(files.sizes)):
@@ -144,7 +142,7 @@ def _check_checksums(folder: Path, members: Iterable[Member], where: str) -> Non
         )
 
 
-def _copy(files: _PackFiles, member: Member, folder: Path) -> None:
+def _copy(files: "_PackFiles", member: Member, folder: Path) -> None:
     target = folder / member.name
     target.parent.mkdir(parents=True, exist_ok=True)
     where = f"{files.where}: {member.name}"
@@ -266,8 +264,9 @@ def _open_archive(file: BinaryIO, path: Path) -> Iterator[_PackFiles]:
         archive = zipfile.ZipFile(cast(IO[bytes], _BoundedReads(file, where)))
     infos = archive.infolist()
     _check_count(len(infos), where)
+    # zipfile replaces backslashes in filename on Windows, and cuts the name at a null character.
     by_name = _without_top_folder(
-        {check_member_name(_plain_name(info), where): info for info in infos if not info.is_dir()}, where
+        {check_member_name(info.orig_filename, where): info for info in infos if not info.is_dir()}, where
     )
     check_unique([info.filename for info in infos], where)
     for name, info in by_name.items():
@@ -279,11 +278,6 @@ def _open_archive(file: BinaryIO, path: Path) -> Iterator[_PackFiles]:
             return cast(BinaryIO, archive.open(by_name[name]))
 
     yield _PackFiles(where, {name: info.file_size for name, info in by_name.items()}, open_entry)
-
-
-def _plain_name(info: zipfile.ZipInfo) -> str:
-    # zipfile replaces backslashes in filename on Windows, and cuts the name at a null character.
-    return info.orig_filename
 
 
 def _without_top_folder(by_name: dict[str, zipfile.ZipInfo], where: str) -> dict[str, zipfile.ZipInfo]:

@@ -13,23 +13,8 @@ from ipsys_log.log.byte_source import BoundError
 from ipsys_log.log.codec import PAYLOADS, payload_type, schema_data
 from ipsys_log.log.contents import Schema, StoredChannel, camera_of_topic, run_of_topic
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import Event
+from ipsys_log.messages import Event, events
 from ipsys_log.messages.channels import CHANNELS, EVENTS, IMAGES, RUN_EVENTS, channel_of
-from ipsys_log.messages.events import (
-    ASSUMED_MODEL,
-    CALIBRATION_CONTRADICTED,
-    CAMERA_MOVED,
-    CONTRADICTED_HEIGHT,
-    FRAME_SKIPPED,
-    FREE_BODY,
-    LOOSE_MARKER,
-    MODEL_CONTRADICTED,
-    NODE_ANSWERS,
-    NODE_AWAITED,
-    OPERATOR_KINDS,
-    STAMP_UNRELIABLE,
-    TILTED_MARKER,
-)
 from ipsys_log.tools.recording import find_gaps
 from ipsys_log.tools.soundness.finding import NOTE, REMARK, LogFinding
 from ipsys_log.units import NS_PER_S
@@ -39,20 +24,22 @@ _PROGRESS_EVERY = 1000
 _USUAL_EVENTS = frozenset(
     (
         *("camera_back", "ambiguous_marker", "unknown_marker", "rejected_marker", "robot_run"),
-        *(NODE_ANSWERS, NODE_AWAITED, *OPERATOR_KINDS),
+        *(events.NODE_ANSWERS, events.NODE_AWAITED, *events.OPERATOR_KINDS),
     )
 )
 _ADVICE = {
-    FRAME_SKIPPED: "the frames are in the log: ipsys replay processes them",
-    STAMP_UNRELIABLE: "these frames have their time of arrival",
-    ASSUMED_MODEL: "if the model is wrong, import or record again with the corrected file",
-    CONTRADICTED_HEIGHT: "correct lab.toml, and give it with --rig",
-    FREE_BODY: "run ipsys replay --model joint",
-    LOOSE_MARKER: "fix the marker, and run ipsys calibrate-body",
-    TILTED_MARKER: "run ipsys replay --method pose",
-    CALIBRATION_CONTRADICTED: "correct lab.toml, or give the file with --calibration CAMERA=calibration.yaml",
-    CAMERA_MOVED: "calibrate the camera again, or run ipsys drift",
-    MODEL_CONTRADICTED: "apply a model of this lab: ipsys replay LOG --model-from calibration.mcap",
+    events.FRAME_SKIPPED: "the frames are in the log: ipsys replay processes them",
+    events.STAMP_UNRELIABLE: "these frames have their time of arrival",
+    events.ASSUMED_MODEL: "if the model is wrong, import or record again with the corrected file",
+    events.CONTRADICTED_HEIGHT: "correct lab.toml, and give it with --rig",
+    events.FREE_BODY: "run ipsys replay --model joint",
+    events.LOOSE_MARKER: "fix the marker, and run ipsys calibrate-body",
+    events.TILTED_MARKER: "run ipsys replay --method pose",
+    events.CALIBRATION_CONTRADICTED: (
+        "correct lab.toml, or give the file with --calibration CAMERA=calibration.yaml"
+    ),
+    events.CAMERA_MOVED: "calibrate the camera again, or run ipsys drift",
+    events.MODEL_CONTRADICTED: "apply a model of this lab: ipsys replay LOG --model-from calibration.mcap",
     "frames_dropped": "record on a faster disk",
     "frames_missed": "reduce the rate or the size of the images, or use another USB bus",
 }

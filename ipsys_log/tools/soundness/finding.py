@@ -1,7 +1,5 @@
 """The findings of a check of a log, and its result."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -61,7 +59,7 @@ class LogCheck:
         return tuple(finding for finding in self.findings if finding.level != NOTE)
 
     @staticmethod
-    def worst(checks: Iterable[LogCheck]) -> str:
+    def worst(checks: "Iterable[LogCheck]") -> str:
         """Return the worst state of several logs."""
         order = (SOUND, READABLE, UNREAD, BROKEN)
         return max((check.state for check in checks), key=order.index, default=SOUND)

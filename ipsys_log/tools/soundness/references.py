@@ -10,17 +10,7 @@ from ipsys_log.engine.states import is_fitted_here
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.contents import camera_of_topic
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import Measurement, Rig
-from ipsys_log.messages.channels import (
-    CLOCKS,
-    MARKERS,
-    MEASUREMENTS,
-    MEASUREMENTS_TOPIC,
-    MODEL,
-    RIG,
-    RIG_TOPIC,
-    clock_topic,
-)
+from ipsys_log.messages import Measurement, Rig, channels
 from ipsys_log.messages.rig_file import check_rig
 from ipsys_log.models.table import is_known, reads_corners
 from ipsys_log.plain_text import join_names
@@ -31,11 +21,11 @@ from ipsys_log.vision.lenses import calibration_remarks, check_calibration
 
 def check_rigs(session: Session) -> Iterator[LogFinding]:
     """Check that a log with images, markers or measurements has a valid rig."""
-    topics = session.topics(RIG)
+    topics = session.topics(channels.RIG)
     if not topics:
-        if session.images or session.topics(MEASUREMENTS) or _marker_cameras(session):
+        if session.images or session.topics(channels.MEASUREMENTS) or _marker_cameras(session):
             advice = "give one to each command: --rig lab.toml"
-            yield LogFinding("reference", REMARK, "the log has no rig", advice, RIG_TOPIC)
+            yield LogFinding("reference", REMARK, "the log has no rig", advice, channels.RIG_TOPIC)
         return
     for message in session.messages(topics):
         try:
@@ -47,7 +37,7 @@ def check_rigs(session: Session) -> Iterator[LogFinding]:
 
 def _marker_cameras(session: Session) -> dict[str, str]:
     """Return the cameras with markers in a run, each with one topic of its markers."""
-    topics = [topic for run in sorted(session.run_names()) for topic in session.topics(MARKERS, run)]
+    topics = [topic for run in sorted(session.run_names()) for topic in session.topics(channels.MARKERS, run)]
     return {str(camera_of_topic(topic)): topic for topic in topics}
 
 
@@ -58,7 +48,7 @@ def _cameras(session: Session) -> dict[str, str]:
 
 def check_cameras(session: Session) -> Iterator[LogFinding]:
     """Check that the rig has each camera with images or markers."""
-    rigs: list[Rig] = session.payloads(session.topics(RIG))
+    rigs: list[Rig] = session.payloads(session.topics(channels.RIG))
     known = {camera.name for rig in rigs for camera in rig.cameras}
     if not known:  # a rig may leave out the cameras
         return
@@ -99,11 +89,11 @@ def check_intrinsics(session: Session) -> Iterator[LogFinding]:
 
 def check_measurements(session: Session) -> Iterator[LogFinding]:
     """Check that measurements name markers and reference points of the rig, and withdrawals measurements."""
-    rigs: list[Rig] = session.payloads(session.topics(RIG))[:1]
+    rigs: list[Rig] = session.payloads(session.topics(channels.RIG))[:1]
     active: set[str] = set()
     withdrawn: set[str] = set()
     faults: dict[tuple[str, str], list[tuple[str, int]]] = {}
-    for message in session.messages([*session.topics(RIG), *session.topics(MEASUREMENTS)]):
+    for message in session.messages([*session.topics(channels.RIG), *session.topics(channels.MEASUREMENTS)]):
         payload = message.payload
         if isinstance(payload, Rig):
             rigs[:] = [payload]
@@ -114,7 +104,7 @@ def check_measurements(session: Session) -> Iterator[LogFinding]:
     for (text, advice), places in faults.items():
         ids = join_names([name for name, _ in places])
         title = "measurement" if len(places) == 1 else "measurements"
-        place = MEASUREMENTS_TOPIC, places[0][1], len(places)
+        place = channels.MEASUREMENTS_TOPIC, places[0][1], len(places)
         yield LogFinding("reference", REMARK, f"{title} {ids}: {text}", advice, *place)
 
 
@@ -252,9 +242,11 @@ class MessageTimes:
 
 def check_clocks(session: Session) -> Iterator[LogFinding]:
     """Check the clock estimates of nodes against the newest joint model that was fitted to this log."""
-    topics = session.topics(CLOCKS)
-    fitted = [run for run in complete_runs(session) if writes(run, MODEL) and is_fitted_here(run)]
-    models = [session.payloads(session.topics(MODEL, run.run))[-1] for run in fitted] if topics else []
+    topics = session.topics(channels.CLOCKS)
+    fitted = [run for run in complete_runs(session) if writes(run, channels.MODEL) and is_fitted_here(run)]
+    models = (
+        [session.payloads(session.topics(channels.MODEL, run.run))[-1] for run in fitted] if topics else []
+    )
     joint = [model for model in models if is_known(model.name) and reads_corners(model.name)]
     if not joint:
         return
@@ -262,4 +254,4 @@ def check_clocks(session: Session) -> Iterator[LogFinding]:
     from ipsys_log.statistics.calibrated_cameras import find_contradicted_clocks
 
     for one in find_contradicted_clocks(joint[-1], session.payloads(topics)):
-        yield LogFinding("time", REMARK, one.text, _ADVICE, clock_topic(one.camera))
+        yield LogFinding("time", REMARK, one.text, _ADVICE, channels.clock_topic(one.camera))

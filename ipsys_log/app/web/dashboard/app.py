@@ -1,7 +1,5 @@
 """The dashboards of a live recording and of a played log, and the app that serves one with its events."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 from collections.abc import AsyncIterator, Callable, Hashable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """The map of the dashboard: the floor with its cameras, and the robots with their trails."""
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Mapping

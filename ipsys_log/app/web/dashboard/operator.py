@@ -1,7 +1,5 @@
 """The operator of a recording: one device at a time marks events and segments in the log."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, NamedTuple
 

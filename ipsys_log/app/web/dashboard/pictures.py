@@ -1,7 +1,5 @@
 """The newest picture of each camera: scaled down once for all pages, with its markers."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Iterable
 from typing import Any

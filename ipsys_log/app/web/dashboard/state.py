@@ -1,7 +1,5 @@
 """The sink of the dashboard: it keeps the newest state of a recording, and gives it as JSON."""
 
-from __future__ import annotations
-
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -10,16 +8,10 @@ from math import isfinite
 from pathlib import Path
 from typing import Any
 
+from ipsys_log.app.web.dashboard import status
 from ipsys_log.app.web.dashboard.map import Robots, describe_floor
 from ipsys_log.app.web.dashboard.operator import Operator
 from ipsys_log.app.web.dashboard.pictures import EVERY_NS, Pictures
-from ipsys_log.app.web.dashboard.status import (
-    CameraStatus,
-    RecentEvents,
-    describe_latencies,
-    describe_recording,
-    describe_streams,
-)
 from ipsys_log.capture.frames import CameraState
 from ipsys_log.capture.live_check import FrameCheck
 from ipsys_log.errors import IpsysError
@@ -81,7 +73,7 @@ class DashboardSetting:
     log: Path
     now_ns: Callable[[], int]
     streams: Sequence[Stream] = ()
-    played: PlayedLog | None = None
+    played: "PlayedLog | None" = None
     positions: PositionMonitor | None = None
 
 
@@ -112,11 +104,11 @@ class Dashboard:
         self._setting, self._begin_ns = setting, setting.now_ns()
         self._floor = describe_floor(setting.rig, setting.model, setting.lenses)
         self._robots = Robots(setting.rig, self._begin_ns)
-        self._events = RecentEvents()
+        self._events = status.RecentEvents()
         played = setting.played
         every_ns = () if played is None else (played.picture_every_ns,)
         self._pictures = Pictures(setting.states, *every_ns)
-        self._cameras = CameraStatus(setting.states, setting.checks, setting.now_ns, played is None)
+        self._cameras = status.CameraStatus(setting.states, setting.checks, setting.now_ns, played is None)
         self._latencies: deque[Latency] = deque(maxlen=_LATENCIES)
         self._overlap = OverlapSummary()
         self._computed: tuple[int, dict[str, Any]] | None = None
@@ -177,7 +169,7 @@ class Dashboard:
             "end": self.end,
             "cameras": self._cameras.rows(last_ns, skipped, session),
             **self._describe_log(now_ns),
-            "streams": describe_streams(self._setting.streams),
+            "streams": status.describe_streams(self._setting.streams),
             **self._statistics(now_ns),
             "events": events,
             **self._describe_positions(),
@@ -227,7 +219,7 @@ class Dashboard:
         played = self._setting.played
         if played is not None:
             return {"playback": played.describe()}
-        return {"recording": describe_recording(self._setting.log, now_ns - self._begin_ns)}
+        return {"recording": status.describe_recording(self._setting.log, now_ns - self._begin_ns)}
 
     def _describe_positions(self) -> dict[str, Any]:
         """Return whether the positions are live, late or stale; nothing before the first frame."""
@@ -241,7 +233,7 @@ class Dashboard:
         if before_ns is None or now_ns == before_ns or now_ns - before_ns >= NS_PER_S:
             with self._lock:
                 latencies, overlap = list(self._latencies), self._overlap.lines()
-            self._computed = now_ns, {"latency": describe_latencies(latencies), "overlap": overlap}
+            self._computed = now_ns, {"latency": status.describe_latencies(latencies), "overlap": overlap}
         assert self._computed is not None
         return self._computed[1]
 

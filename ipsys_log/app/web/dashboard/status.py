@@ -1,7 +1,5 @@
 """The state of cameras, recording and streams, the durations of the steps, and the last events, as JSON."""
 
-from __future__ import annotations
-
 import shutil
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping, Sequence

@@ -13,6 +13,7 @@ import pytest
 from ipsys_log.calibration.joint.payload import restore_joint
 from ipsys_log.engine.output import write_log
 from ipsys_log.log.dataset import Session
+from ipsys_log.messages import RigMarker
 from ipsys_log.messages.channels import MODEL, POSITIONS
 from tests.conftest import Ipsys
 from tests.joint.carried_wand import CarriedWand, carry_wand, wand_messages
@@ -62,6 +63,40 @@ def test_lab_without_rest_and_points_has_no_certain_coordinates(
     with Session([tmp_path / "a.mcap"]) as session:
         models = restore_joint(session.payloads([MODEL.topic_of("joint")])[-1])
     assert not any(model.is_certain for model in models.values())
+
+
+def test_wrong_markers_of_a_carried_body_are_named(ipsys: Ipsys, wand: CarriedWand, tmp_path: Path) -> None:
+    def spoil(marker: RigMarker) -> RigMarker:
+        if marker.id == 2:
+            x_m, y_m, z_m = marker.xyz_m
+            return replace(marker, xyz_m=(x_m + 0.003, y_m, z_m))
+        return replace(marker, xyz_m=(), rpy_rad=()) if marker.id == 4 else marker
+
+    rig = replace(wand.rig, markers=tuple(map(spoil, wand.rig.markers)))
+    write_log(tmp_path / "a.mcap", wand_messages(replace(wand, rig=rig)))
+    found = json.loads(ipsys("calibrate-lab", tmp_path / "a.mcap", "--body", "wand", "--json").out)
+    unknown, contradiction = found["remarks"]
+    assert unknown == "marker 4 of wand has no pose in the rig: it is not used"
+    assert contradiction.startswith("marker 2 of wand contradicts the others, by ")
+    for camera in found["cameras"]:
+        true = wand.camera_from_world[camera["camera"]]
+        assert camera["origin_m"] == pytest.approx(-true[:3, :3].T @ true[:3, 3], abs=0.01)
+
+
+def test_prints_that_contradict_measured_points_are_named(ipsys: Ipsys, tmp_path: Path) -> None:
+    wand = carry_wand(7, count=2, duration_s=8.0, taped=True)
+    markers = tuple(replace(one, length_m=1.01 * (one.length_m or 0.12)) for one in wand.rig.markers)
+    markers = tuple(
+        replace(one, xyz_m=tuple(1.01 * length for length in one.xyz_m)) if one.xyz_m else one
+        for one in markers
+    )
+    write_log(tmp_path / "a.mcap", wand_messages(replace(wand, rig=replace(wand.rig, markers=markers))))
+    found = json.loads(ipsys("calibrate-lab", tmp_path / "a.mcap", "--body", "wand", "--json").out)
+    assert any("the measured points are 1.0 % nearer together" in remark for remark in found["remarks"])
+    for camera in found["cameras"]:
+        true = wand.camera_from_world[camera["camera"]]
+        errors_m = np.abs(camera["origin_m"] + true[:3, :3].T @ true[:3, 3])
+        assert (errors_m < 3 * np.array(camera["origin_sigmas_m"]) + 0.002).all()
 
 
 def test_bad_input_of_a_carried_lab_is_one_line(ipsys: Ipsys, log: Path, tmp_path: Path) -> None:

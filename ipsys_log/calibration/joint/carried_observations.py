@@ -49,6 +49,7 @@ def gather_carried(
     markers: Mapping[str, Sequence[Markers]],
     robot: str,
     measurements: Sequence[Measurement],
+    left_out: Collection[int] = (),
 ) -> tuple[Observations, list[Target], Interval | None]:
     """Return the sightings of a carried body, the known poses of stationary markers, and the body's rest.
 
@@ -62,13 +63,14 @@ def gather_carried(
     markers : the detections of each camera, in order of time.
     robot : the body.
     measurements : the valid measurements.
+    left_out : markers of the body that contradict the others.
 
     Raises
     ------
     IpsysError
         The rig has no such body, the poses of its markers are not known, or no camera sees it.
     """
-    shape = _shape(rig, robot)
+    shape = _without_markers(_shape(rig, robot), left_out)
     markers = {camera: markers[camera] for camera in sorted(markers)}
     rest, resting = None, list[Measurement]()
     ids = {f"{_REST} {marker_id}": marker_id for marker_id in shape.markers}
@@ -151,6 +153,12 @@ def _shape(rig: Rig, robot: str) -> BodyShape:
         known = ", ".join(shapes) or "none"
         raise IpsysError(f"{robot}: is no body of the rig, which has {known}; add it to [[bodies]]")
     return shapes[robot]
+
+
+def _without_markers(shape: BodyShape, ids: Collection[int]) -> BodyShape:
+    """Return a body without some of its markers."""
+    corners_m = {marker_id: own for marker_id, own in shape.corners_m.items() if marker_id not in ids}
+    return replace(shape, markers={i: shape.markers[i] for i in corners_m}, corners_m=corners_m)
 
 
 def _is_seen(measurement: Measurement, markers: Mapping[str, Sequence[Markers]]) -> bool:

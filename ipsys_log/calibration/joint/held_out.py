@@ -104,6 +104,22 @@ def corner_sigma(fit: JointFit) -> float:
     return float(np.sqrt(squares / max(freedom, 1)))
 
 
+def misfits(fit: JointFit) -> dict[str, float]:
+    """Return the errors of each part of the moving body, such as a marker, in units of its noise.
+
+    They are the roots of the median chi2 of a coordinate: about 0.9 if the part fits.
+    """
+    parts: dict[str, list[Array]] = {}
+    for factors in fit.problem.sightings:
+        if factors.kind is Kind.FREE:
+            visible = np.isfinite(factors.sightings.pixels[:, :, 0]).sum(axis=1)
+            chi2 = factors.chi2(fit.state, fit.problem.layout, fit.problem.trajectories) / (2 * visible)
+            for body in np.unique(factors.sightings.body).tolist():
+                own = chi2[factors.sightings.body == body]
+                parts.setdefault(fit.observations.bodies[body].name, []).append(own)
+    return {name: float(np.sqrt(np.median(np.concatenate(own)))) for name, own in parts.items()}
+
+
 def distance_errors(fit: JointFit) -> Array:
     """Return errors (n,) of the distances of neighbouring points of a board, which pairs of cameras measure.
 

@@ -99,6 +99,14 @@ def first_camera(fit: JointFit) -> LabFrame:
     return LabFrame(np.eye(3), np.zeros(3), none, np.zeros((_POSE, _POSE)), 0.0, 0, ("", 0.0))
 
 
+def relative_length(fit: JointFit, targets: Sequence[Target]) -> float:
+    """Return by how much the targets are farther apart than in the fit, as a share of their distances."""
+    known_m = np.array([target.position_m for target in targets])
+    seen_m = fit.state.positions_m[[target.number for target in targets]]
+    spreads_m = [float(np.sqrt(((own - own.mean(axis=0)) ** 2).sum())) for own in (known_m, seen_m)]
+    return spreads_m[0] / spreads_m[1] - 1
+
+
 class _Pose:
     """A stationary marker in the fit, and its target. Its own covariance is that for constant cameras."""
 

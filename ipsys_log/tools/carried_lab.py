@@ -224,6 +224,15 @@ def _describe(
             f"the measured points are {more} than by the prints of {body}; measure the sides of its markers, "
             "and check the tape",
         )
+    origins_m = [
+        in_lab.state.values[block.start + 3 : block.start + 6] for block in in_lab.problem.layout.cameras
+    ]
+    below = [name for name, origin_m in zip(names, origins_m, strict=True) if origin_m[2] < 0]
+    if rest is not None and below:
+        remarks += (
+            f"camera {', '.join(below)} would be below the floor: {body} did not lie with its z axis up; lay "
+            "it down again",
+        )
     held_out = dict(zip(names, errors_px, strict=True))
     distances_m = distance_errors(fit) if fit.observations.bodies[0].name == BOARD else np.zeros(0)
     return CarriedLab(body, in_lab, frame, rest, held_out, distances_m, remarks)

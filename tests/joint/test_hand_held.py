@@ -7,9 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ipsys_log.calibration.board import Board
+from ipsys_log.calibration.board_detection import BoardSighting
+from ipsys_log.calibration.joint.carried_observations import gather_board
 from ipsys_log.calibration.joint.fit import JointFit
 from ipsys_log.calibration.joint.hand_held import fit_hand_held
 from ipsys_log.calibration.joint.held_out import predict_errors
+from ipsys_log.calibration.joint.lab_frame import apply_frame, find_frame
 from ipsys_log.calibration.joint.observations import (
     Body,
     CalibrationPoint,
@@ -20,6 +24,7 @@ from ipsys_log.calibration.joint.observations import (
 from ipsys_log.calibration.joint.settings import JointSettings
 from ipsys_log.errors import FitError
 from ipsys_log.messages import CameraCalibration
+from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.lenses import project
 from ipsys_log.vision.poses import make_pose, rotation, transform
 from tests.joint.differences import jacobian_of, residuals_of
@@ -82,6 +87,33 @@ def wave_board(moving: bool, noise_px: float = 0.05, least: int = 6) -> Observat
     points = () if moving else tuple(CalibrationPoint(str(n), 0) for n in range(60))
     cameras = tuple(CameraPrior(f"c{n}", lens) for n in range(3))
     return Observations(cameras, (Body("0", BOARD_M, 0.0),), points, tuple(sightings))
+
+
+def test_board_at_rest_with_its_face_up_is_below_the_cameras() -> None:
+    lens = wave_board(moving=True).cameras[0].lens
+    cameras, board = make_cameras(), Board(4, 5, 0.05, 0.75)
+    sightings = {
+        f"c{n}": [
+            (
+                round((10.0 + 0.1 * index) * NS_PER_S),
+                BoardSighting("", np.arange(12), pixels, 1.0, pixels[[0, 2, 11, 9]]),
+            )
+            for index in range(70)
+            for pixels in [project(transform(camera @ board_pose(min(0.1 * index, 4.0)), BOARD_M), lens)]
+        ]
+        for n, camera in enumerate(cameras)
+    }
+    lenses = {f"c{n}": lens for n in range(3)}
+    observations, targets, rest = gather_board(lenses, (), sightings, board)
+    assert rest is not None
+    assert rest.start == pytest.approx(14.2 * NS_PER_S, abs=1e8)
+    fit = fit_hand_held(observations, FIXED)
+    lab = apply_frame(fit, find_frame(fit, targets), 0.0, 0.0, np.zeros(3))
+    lab_from_world = np.diag([1.0, -1.0, -1.0, 1.0]) @ np.linalg.inv(board_pose(4.0))
+    for block, camera in zip(lab.problem.layout.cameras, cameras, strict=True):
+        origin_m = lab.state.values[block.start + 3 : block.start + 6]
+        assert origin_m == pytest.approx((lab_from_world @ np.linalg.inv(camera))[:3, 3], abs=1e-3)
+        assert origin_m[2] > 0.5
 
 
 def camera_errors(fit: JointFit) -> Array:

@@ -28,7 +28,7 @@ from ipsys_log.vision.poses import level_turns
 
 # A body is at rest while the centres of its markers move less than this, for at least this time. At its ends,
 # a marker may still move in the images of other cameras.
-_STILL_PX, _STILL_NS, _END_NS = 0.5, NS_PER_S, NS_PER_S // 5
+_STILL_PX, _STILL_NS, _END_NS = 0.5, 2 * NS_PER_S, NS_PER_S // 5
 _GAP_NS = NS_PER_S // 2
 # More frames per second cost time and give little: the path has knots some 0.1 s apart.
 _LEAST_STEP_NS = NS_PER_S // 16
@@ -36,6 +36,8 @@ _UNKNOWN_CORNER_PX = 0.25
 # A pose of a marker on its body is exact beside the errors of the cameras.
 _EXACT = np.repeat([1e-5, 1e-4], 3)
 _REST = "rest"
+# The z axis of a board goes into it, that of a lab goes up.
+_FACE_UP = np.diag([1.0, -1.0, -1.0])
 # The name of the only body of the sightings of a board.
 BOARD = "board"
 # Before the fit shows the errors of the corners of a board.
@@ -102,6 +104,8 @@ def gather_board(
 ) -> tuple[Observations, list[Target], Interval | None]:
     """Return the sightings of a carried board, its pose at rest, and the time of the rest.
 
+    At rest, the x axis of the lab goes along the rows of the board, and the z axis out of it.
+
     Parameters
     ----------
     lenses, nominal : as for :func:`gather_carried`.
@@ -124,7 +128,7 @@ def gather_board(
     parts = tuple(_board_table(own, rest, epoch_ns, len(points_m)) for own in sightings.values())
     cameras = tuple(CameraPrior(name, lenses[name], name in nominal, None) for name in sightings)
     points = () if rest is None else (CalibrationPoint(_REST, 0),)
-    targets = [] if rest is None else [Target(0, _REST, np.zeros(3), np.eye(3), _EXACT)]
+    targets = [] if rest is None else [Target(0, _REST, np.zeros(3), _FACE_UP, _EXACT)]
     return Observations(cameras, (Body(BOARD, points_m, 0.0),), points, parts), targets, rest
 
 

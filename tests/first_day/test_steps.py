@@ -28,6 +28,20 @@ D, R, W = Status.DONE, Status.READY, Status.WAITS
 RIG = 'name = "lab"\ndictionary = "DICT_4X4_100"\nmarker_length_m = 0.2\n'
 USB = f'{RIG}[[cameras]]\nname = "red"\nsource = "usb:{os.devnull}"\n'
 
+DRONE = """
+[[markers]]
+id = 90
+length_m = 0.1
+robot = "drone"
+[[markers]]
+id = 91
+length_m = 0.1
+robot = "drone"
+[[bodies]]
+robot = "drone"
+level = false
+"""
+
 
 def statuses(folder: LabFolder) -> list[Status]:
     return [step.status for step in read_progress(folder).steps]
@@ -103,6 +117,10 @@ def test_log_from_the_terminal_finishes_steps(
     means_m = model.to_frame()["mean_m"]
     assert any(progress.fit.mean_m == pytest.approx(mean_m) for mean_m in means_m)
     assert progress.fit.answer[0].startswith("Model: ")
+    plain = folder.rig_file.read_text()
+    folder.rig_file.write_text(plain + DRONE)
+    assert "calibrate-body carry.mcap --robot drone" in read_progress(folder).step("live").text
+    folder.rig_file.write_text(plain)
     shutil.copy(recorded, folder.path / "monday.mcap")
     assert statuses(folder)[4:] == [D, D, D, D]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from ipsys_log.calibration.joint.floor_field import make_floor_field
 from ipsys_log.calibration.joint.model import JointModel
@@ -28,10 +29,12 @@ from ipsys_log.vision.markers import MovingMarker, PlacedMarker
 from ipsys_log.vision.poses import invert_pose, make_pose, pose_facing_up, rotation, rotation_vector
 
 LAB = LabSettings(row_time_ns=31_000, exposure_s=0.004)
-# A tilted marker beside a level one.
+# Tilted markers beside a level one.
 MARKERS = (
     RigMarker(0, 0.1, "drone"),
     RigMarker(1, 0.1, "drone", xyz_m=(0.16, 0.05, -0.02), rpy_rad=(0.2, 0.1, 0.6)),
+    RigMarker(2, 0.1, "drone", xyz_m=(-0.02, 0.17, -0.01), rpy_rad=(-0.15, 0.2, -0.4)),
+    RigMarker(3, 0.1, "drone", xyz_m=(-0.17, 0.02, -0.03), rpy_rad=(0.1, -0.25, 2.0)),
 )
 FRAMES, RATE_HZ = 14, 30.0
 # Detection knows the motion of a marker after three frames.
@@ -73,13 +76,17 @@ def moving(camera: Camera, marker: RigMarker, stamp_s: float) -> MovingMarker:
     return lambda time_s: PlacedMarker(marker.id, 0.1, pose_at(camera, stamp_s + time_s) @ body_from_marker)
 
 
-def test_poses_of_a_rendered_body_have_the_errors_that_they_state() -> None:
+@pytest.mark.parametrize(("count", "most_m", "most_deg"), [(1, 6e-4, 0.12), (2, 4e-4, 0.1), (4, 1e-4, 0.03)])
+def test_poses_of_a_rendered_body_have_the_errors_that_they_state(
+    count: int, most_m: float, most_deg: float
+) -> None:
+    markers = MARKERS[:count]
     camera = mount_cameras(LAB)[0]
     rig = Rig(
         "lab",
         LAB.dictionary,
         0.2,
-        MARKERS,
+        markers,
         (RigCamera(camera.name, row_time_ns=LAB.row_time_ns),),
         bodies=(RigBody("drone", level=False),),
     )
@@ -92,7 +99,7 @@ def test_poses_of_a_rendered_body_have_the_errors_that_they_state() -> None:
     for number in range(FRAMES):
         stamp_s = number / RATE_HZ
         stamp_ns = round(stamp_s * 1e9)
-        image = render(view, [moving(camera, marker, stamp_s) for marker in MARKERS], LAB, rng)
+        image = render(view, [moving(camera, marker, stamp_s) for marker in markers], LAB, rng)
         frame = CompressedImage(stamp_ns, camera.name, encode_jpeg(image, LAB), "jpeg")
         (seen,) = (
             one
@@ -121,6 +128,6 @@ def test_poses_of_a_rendered_body_have_the_errors_that_they_state() -> None:
     assert np.linalg.norm(single_m[FIRST:], axis=1).mean() < 2e-3
     lengths_m = np.linalg.norm(np.array(errors)[FIRST:, :3], axis=1)
     angles_rad = np.linalg.norm(np.array(errors)[FIRST:, 3:], axis=1)
-    assert lengths_m.mean() < 4e-4
-    assert np.degrees(angles_rad.mean()) < 0.1
+    assert lengths_m.mean() < most_m
+    assert np.degrees(angles_rad.mean()) < most_deg
     assert 0.3 < np.mean(squares[FIRST:]) < 1.5

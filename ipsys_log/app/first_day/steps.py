@@ -109,7 +109,7 @@ def read_progress(folder: LabFolder) -> SetupProgress:
         _drive_step(rig, cameras, logs, missing),
         _points_step(rig, cameras, logs, missing),
         _accuracy_step(folder.calibration_logs(), logs, fit),
-        _live_step(logs, fit, missing),
+        _live_step(rig, logs, fit, missing),
     )
     return SetupProgress(rig, cameras, intrinsics, logs, alignment, fit, steps)
 
@@ -258,7 +258,7 @@ def _accuracy_step(calibration: list[Path], logs: tuple[LogFacts, ...], fit: Fit
     return StepState("accuracy", title, command, Status.READY, text)
 
 
-def _live_step(logs: tuple[LogFacts, ...], fit: FitFacts | None, missing: str) -> StepState:
+def _live_step(rig: Rig | None, logs: tuple[LogFacts, ...], fit: FitFacts | None, missing: str) -> StepState:
     log, model = (shell_words(fit.log.name), fit.model) if fit else ("calibration.mcap", "joint")
     command = f"ipsys live --rig lab.toml --model-from {log} --model {model} -o live.mcap --web"
     tracked = [log.path.name for log in logs if log.tracked]
@@ -267,5 +267,17 @@ def _live_step(logs: tuple[LogFacts, ...], fit: FitFacts | None, missing: str) -
     elif missing or fit is None:
         status, text = Status.WAITS, missing or "first calibrate the lab"
     else:
-        status, text = Status.READY, ""
+        status, text = Status.READY, "" if rig is None else _unknown_bodies(rig)
     return StepState("live", "Live view", command, status, text)
+
+
+def _unknown_bodies(rig: Rig) -> str:
+    """Return the command that finds the poses of markers on bodies, for the first body that needs it."""
+    for body in rig.bodies:
+        own = [marker for marker in rig.markers if marker.robot == body.robot]
+        if any(not marker.xyz_m for marker in own[1:]):
+            return (
+                f"the poses of the markers on {body.robot} are unknown: record it while you carry it for "
+                f"20 s, then run: ipsys calibrate-body carry.mcap --robot {body.robot} --write lab.toml"
+            )
+    return ""

@@ -65,7 +65,7 @@ class CarriedLab:
     fit : the cameras, in the coordinates of the lab.
     frame : these coordinates, in those of the first camera.
     rest : the time at which the body at rest defines the coordinates; None: measured points define them.
-    held_out_px : reprojection errors of each camera, (n, 4, 2), in frames that were not in the fit.
+    held_out_px : reprojection errors of each camera, (n, p, 2), in frames that were not in the fit.
     distance_errors_m : (n,), of neighbouring points of a board that two cameras measure at held-out instants;
         none for a body of markers.
     remarks : what contradicts the rig or the tape.

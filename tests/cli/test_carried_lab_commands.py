@@ -105,8 +105,9 @@ def test_bad_input_of_a_carried_lab_is_one_line(ipsys: Ipsys, log: Path, tmp_pat
         (("--body", "ada"), "ada: is no body of the rig, which has wand"),
         (("--body", "wand", "--board", "6x4"), "--board cannot be used with --body"),
         (("--body", "wand", "--plot", tmp_path / "a.png"), "--plot cannot be used with --body"),
-        (("--board", "6"), "--board 6: is not a board"),
-        (("--board", "6x4"), "has no frames of a board"),
+        (("--board", "6", "--square", "0.03"), "--board 6: is not a board"),
+        (("--board", "6x4"), "--board: add --square, the side of a square in m"),
+        (("--board", "6x4", "--square", "0.03"), "has no frames of a board"),
     ):
         done = ipsys("calibrate-lab", log, *words)
         assert done.code == 1

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from ipsys_log.app.cli import lab_inputs
 from ipsys_log.app.cli import options as cli
-from ipsys_log.app.cli.calibrate import Dictionary, Inverted, MarkerScale, Square
+from ipsys_log.app.cli.calibrate import Dictionary, Inverted, MarkerScale
 from ipsys_log.app.cli.console import print_result, progress_bar, say
 from ipsys_log.app.cli.open_cameras import check_target, open_cameras, prepare_lab
 from ipsys_log.app.cli.options import figure_option, log_argument, log_option, setting, switch
@@ -68,6 +68,9 @@ CarriedBoard = Annotated[
         "--board", "COLUMNSxROWS", "Use a board in the frames that is carried by hand, such as charuco:4x5."
     ),
 ]
+Square = Annotated[
+    float | None, setting("--square", "METRES", "Side of a square of --board, in m: the unit of all lengths.")
+]
 _LEAST_POINTS = 2
 
 
@@ -76,7 +79,7 @@ def calibrate_lab(
     goal_mm: Goal = 3.0,
     body: CarriedBody = None,
     board: CarriedBoard = None,
-    square: Square = 0.03,
+    square: Square = None,
     marker_scale: MarkerScale = 0.75,
     dictionary: Dictionary = "DICT_4X4_50",
     inverted: Inverted = False,
@@ -152,7 +155,11 @@ def calibrate_lab(
         if plot is not None or (body is not None and board is not None):
             other = "--plot" if plot is not None else "--board"
             raise IpsysError(f"{other} cannot be used with {'--board' if body is None else '--body'}")
-        carried = body or parse_board(board or "", square, marker_scale, dictionary, inverted)
+        if board is not None and square is None:
+            raise IpsysError(
+                "--board: add --square, the side of a square in m: it is the unit of all lengths"
+            )
+        carried = body or parse_board(board or "", square or 0.0, marker_scale, dictionary, inverted)
         _calibrate_carried(logs, carried, given_rig, given, output, as_json)
         return
     with derive(logs, "fit", output, **given) as (session, outcomes, _):

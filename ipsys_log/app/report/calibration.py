@@ -247,7 +247,7 @@ def carried_table(lab: CarriedLab) -> Rows:
                 f"{camera['focal_px'][0]:.1f}",
                 clock,
                 f"{1000 * camera['clock_sigma_s']:.2f}",
-                f"{camera['held_out_rmse_px']:.2f}",
+                "-" if camera["held_out_rmse_px"] is None else f"{camera['held_out_rmse_px']:.2f}",
             ]
         )
     heads = ("camera", ">x m", ">y m", ">z m", ">± mm", ">focal px", ">clock ms", ">±", ">held out px")
@@ -300,6 +300,7 @@ def _carried_cameras(lab: CarriedLab) -> list[dict[str, Any]]:
         block, values = fit.problem.layout.cameras[number], fit.state.values
         origin = slice(block.start + 3, block.start + 6)
         lengths_px = np.linalg.norm(errors_px, axis=2)
+        lengths_px = lengths_px[np.isfinite(lengths_px)]
         rows.append(
             {
                 "camera": name,
@@ -313,8 +314,8 @@ def _carried_cameras(lab: CarriedLab) -> list[dict[str, Any]]:
                 "clock_s": float(values[block.edge + 1]),
                 "clock_sigma_s": float(sigmas[block.edge + 1]),
                 "row_time_s": float(values[block.edge + 2]),
-                "held_out_rmse_px": float(np.sqrt(np.nanmean(lengths_px**2))),
-                "held_out_median_px": float(np.nanmedian(lengths_px)),
+                "held_out_rmse_px": float(np.sqrt(np.mean(lengths_px**2))) if len(lengths_px) else None,
+                "held_out_median_px": float(np.median(lengths_px)) if len(lengths_px) else None,
             }
         )
     return rows

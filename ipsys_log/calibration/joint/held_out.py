@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import replace
 
 import cv2
@@ -17,6 +18,7 @@ from ipsys_log.calibration.joint.observations import Observations, Sightings
 from ipsys_log.calibration.joint.sighting_factors import make_sighting_factors
 from ipsys_log.calibration.joint.trajectories import Kind
 from ipsys_log.calibration.lens_models import project_points
+from ipsys_log.errors import FitError
 from ipsys_log.messages import Array
 from ipsys_log.vision.lenses import undistort
 
@@ -35,6 +37,8 @@ def predict_errors(fit: JointFit, camera: int, sightings: Sightings) -> Array:
     (n, p, 2) in px; NaN for a point that is not visible.
     """
     visible = np.isfinite(sightings.pixels)
+    if not len(sightings):
+        return np.zeros(visible.shape)
     kind = Kind.FREE if (sightings.point < 0).all() else Kind.STATIONARY
     paths = fit.problem.trajectories.free_paths
     number = sightings.point if kind is Kind.STATIONARY else path_at(paths, sightings.times_s)
@@ -60,16 +64,18 @@ def hold_out_halves(
     step_s = float(paths.steps_s[0])
     for camera, own in enumerate(observations.sightings):
         moving = (own.point < 0) & covers(paths, own.times_s)
-        half_s = np.median(own.times_s[moving])
+        half_s = float(np.median(own.times_s[moving])) if moving.any() else 0.0
         shared = _shares(observations, camera)
         parts = []
         for number, out in enumerate((moving & (own.times_s < half_s), moving & (own.times_s >= half_s))):
             kept = [*observations.sightings]
             kept[camera] = own.select(~out)
-            rest = fit_hand_held(replace(observations, sightings=tuple(kept)), fit.settings, step_s)
-            parts.append(predict_errors(rest, camera, own.select(out & shared)))
+            # Half of the time may not link all cameras.
+            with suppress(FitError):
+                rest = fit_hand_held(replace(observations, sightings=tuple(kept)), fit.settings, step_s)
+                parts.append(predict_errors(rest, camera, own.select(out & shared)))
             progress(2 * camera + number + 1, 2 * count)
-        errors.append(np.concatenate(parts))
+        errors.append(np.concatenate([np.zeros((0, *own.pixels.shape[1:])), *parts]))
     return errors
 
 
@@ -137,9 +143,10 @@ def distance_errors(fit: JointFit) -> Array:
         parts = zip(fit.observations.sightings, inside, strict=True)
         kept, out = zip(*((own.select(~mask), own.select(mask)) for own, mask in parts), strict=True)
         step_s = float(fit.problem.trajectories.free_paths.steps_s[0])
-        cameras = fit_hand_held(replace(fit.observations, sightings=kept), fit.settings, step_s)
-        path = fit_path(cameras, replace(fit.observations, sightings=out), step_s)
-        errors += list(_distance_errors(path))
+        with suppress(FitError):
+            cameras = fit_hand_held(replace(fit.observations, sightings=kept), fit.settings, step_s)
+            path = fit_path(cameras, replace(fit.observations, sightings=out), step_s)
+            errors += list(_distance_errors(path))
     return np.concatenate(errors) if errors else np.zeros(0)
 
 

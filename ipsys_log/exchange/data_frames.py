@@ -352,7 +352,7 @@ _COLUMNS = {
     "measurements": [
         *("time", "log_time_ns", "id", "marker_id", "side", "height_m", "x_m", "y_m", "z_m"),
         *("still_start", "still_end", "distances_m", "splits", "withdraws"),
-        *("readmits", "reason"),
+        *("readmits", "from_reference", "reason"),
     ],
     "pairs": [
         *("time", "log_time_ns", "camera", "id", "marker_id", "xc_m", "yc_m", "zc_m"),

@@ -14,7 +14,9 @@ from scipy.spatial.transform import Rotation
 
 import ipsys_log as ipsys
 from ipsys_log import IpsysError
+from ipsys_log.engine.output import write_log
 from ipsys_log.exchange import data_frames
+from ipsys_log.messages import Distance, Measurement, Message
 from tests.exchange.driven_lab import evo_rmse_m
 from tests.sinks.streaming import TILT_RAD, tilted_track, write_tilted
 
@@ -67,6 +69,14 @@ def test_parquet_has_the_values_of_the_table(
         read = [json.loads(text) for text in values] if column == "distances_m" else values
         known = expected[column].tolist()
         assert list(map(_comparable, read)) == list(map(_comparable, known)), column
+
+
+def test_table_of_measurements_names_the_ends_of_a_baseline(tmp_path: Path) -> None:
+    reading = Measurement(1, "ab", distances=(Distance("B", 4.0),), from_reference="A")
+    write_log(tmp_path / "a.mcap", [Message("/measurements", 1, 1, reading)])
+    with ipsys.open(tmp_path / "a.mcap") as opened:
+        (row,) = opened.table("measurements").to_dict("records")
+    assert (row["from_reference"], row["distances_m"]) == ("A", {"B": 4.0})
 
 
 def _comparable(value: object) -> object:

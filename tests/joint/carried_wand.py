@@ -90,7 +90,7 @@ def aim(place_m: Array, at_m: Array) -> Array:
     return make_pose(turn, -turn @ place_m)
 
 
-class _Wave:
+class Wave:
     """Smooth random motion: sums of waves with random phases."""
 
     def __init__(self, rng: np.random.Generator, amplitudes: Array, frequencies_hz: Array) -> None:
@@ -131,8 +131,8 @@ def carry_wand(
         wrong[[0, 1], [0, 1]] *= 1 + 0.001 * errors[:2]
         wrong[:2, 2] += errors[2:]
         before[f"c{n}"] = replace(lens, K=wrong)
-    place = _Wave(rng, np.array([1.3, 1.3, 0.5]), np.array([0.13, 0.31]))
-    tilt = _Wave(rng, np.array([0.8, 0.8, 0.0]), np.array([0.2, 0.41]))
+    place = Wave(rng, np.array([1.3, 1.3, 0.5]), np.array([0.13, 0.31]))
+    tilt = Wave(rng, np.array([0.8, 0.8, 0.0]), np.array([0.2, 0.41]))
 
     def pose_at(time_s: float) -> Array:
         if time_s >= duration_s:

@@ -176,12 +176,12 @@ from ipsys_log.live_runs import pipeline
 from ipsys_log.app.cli import open_cameras
 from ipsys_log.app.cli.signals import InterruptError, interruptible, runs_until_stopped
 from ipsys_log.errors import IpsysError
-from ipsys_log.log.journal import Disk
+from ipsys_log.log.journal import Storage
 from ipsys_log.messages import RigCamera
 from ipsys_log.capture.multiplexer import LiveCameras
 from ipsys_log.capture.frames import Clock, Frame
 
-what, pwrite = sys.argv[2], Disk.pwrite
+what, pwrite = sys.argv[2], Storage.pwrite
 
 @contextmanager
 def opened(camera, clock, say):
@@ -211,7 +211,7 @@ def record():
         with open_cameras._stop_after(lambda: stop(attached), None):
             pipeline.record(attached, [], Path(sys.argv[1]))
 
-Disk.pwrite = hanging
+Storage.pwrite = hanging
 try:
     record()
 except IpsysError as error:

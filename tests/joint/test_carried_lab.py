@@ -9,10 +9,11 @@ import pytest
 
 from ipsys_log.calibration.joint.carried_observations import gather_carried
 from ipsys_log.calibration.joint.fit import JointFit
+from ipsys_log.calibration.joint.hand_held import fit_hand_held
 from ipsys_log.calibration.joint.held_out import corner_sigma, hold_out_halves
 from ipsys_log.calibration.joint.lab_frame import LabFrame
 from ipsys_log.calibration.joint.model import build_models
-from ipsys_log.errors import IpsysError
+from ipsys_log.errors import FitError, IpsysError
 from tests.joint.carried_wand import BODY, CLOCKS_S, ROW_S, CarriedWand, calibrate, carry_wand, pose_errors
 from tests.joint.small_lab import Array
 
@@ -90,6 +91,13 @@ def test_measured_points_define_the_coordinates_and_a_wrong_one_is_named() -> No
     worst = calibrate(wrong)[1].worst
     assert worst[0] == "p2"
     assert worst[1] > 8
+
+
+def test_motion_that_is_too_short_is_refused(wand: CarriedWand) -> None:
+    short = {camera: own[:3] for camera, own in wand.markers.items()}
+    observations, _, _ = gather_carried(wand.rig, wand.lenses, (), short, BODY, [])
+    with pytest.raises(FitError, match="the body moves in too few frames; carry it for 20 s"):
+        fit_hand_held(observations)
 
 
 def test_unknown_bodies_and_bodies_that_are_not_seen_are_refused(wand: CarriedWand) -> None:

@@ -214,7 +214,10 @@ def _on_floor(point: CalibrationPoint, number: int) -> Target | None:
     if point.covariance_m2 is not None:
         sigma_m = float(np.sqrt(point.covariance_m2.diagonal().max()))
     tilt_rad = JointSettings().point_tilt_sigma_rad
-    height_sigma_m = float(np.hypot(point.height_sigma_m, JointSettings().floor_sigma_m))
+    # A marker without a height is somewhere above its point.
+    height_sigma_m = np.inf
+    if point.height_m is not None:
+        height_sigma_m = float(np.hypot(point.height_sigma_m, JointSettings().floor_sigma_m))
     sigmas = np.array([sigma_m, sigma_m, height_sigma_m, tilt_rad, tilt_rad, np.inf])
     return Target(number, point.name, np.array([*place, point.height_m or 0.0]), np.eye(3), sigmas)
 

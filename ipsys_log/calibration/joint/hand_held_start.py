@@ -133,6 +133,8 @@ def start_path(
         for rows in _divide(times_s, Rotation.from_matrix(poses[:, :3, :3]), np.arange(len(times_s)))
         if len(np.unique(times_s[rows])) >= _LEAST_SIGHTINGS and np.ptp(times_s[rows]) > 2 * step_s
     ]
+    if not parts:
+        raise FitError("the body moves in too few frames; carry it for 20 s where two cameras see it")
     columns, first = [], 0
     for rows in parts:
         own = cover_times(times_s[rows], step_s)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from statistics import median_low
 
 import numpy as np
 
@@ -37,7 +38,7 @@ from ipsys_log.vision.bodies import body_shapes
 # Between a body that lies on the floor and its marker: paper and plates bend by half a millimetre.
 _LAID_TILT_RAD = 0.001
 _CONTRADICTED = 4.0  # standard deviations
-# A marker whose pose in the rig is wrong by 2 mm fits 1.8 times worse than the others.
+# A marker whose pose in the rig is wrong by 2 mm fits 2 to 4 times worse than the others.
 _CONTRADICTED_MISFIT = 1.5
 # Six points measured to 1 mm, some metres apart, show 0.05 %.
 _ODD_LENGTH = 0.003
@@ -117,7 +118,7 @@ def calibrate_carried_lab(
         gathered = gather_carried(rig, lenses, _nominal(lenses), markers, robot, measured, left_out)
         fit = fit_motion(_fit(gathered[0], JointSettings(), progress))
         worst = _find_contradiction(misfits(fit))
-        if worst is None or len(left_out) + 2 > len(ids):
+        if worst is None:
             break
         left_out[int(worst[0])] = (
             f"marker {worst[0]} of {robot} contradicts the others, by {worst[1]:.1f} times its noise: it is "
@@ -138,7 +139,7 @@ def calibrate_with_board(
     lenses: Mapping[str, CameraCalibration],
     progress: Progress = lambda what, done, total: None,
 ) -> tuple[CarriedLab, Run, Message]:
-    """Do the same with a board in the frames of the log.
+    """Estimate the same from a board in the frames of the log.
 
     Raises
     ------
@@ -173,12 +174,15 @@ def calibrate_with_board(
 
 
 def _find_contradiction(errors: Mapping[str, float]) -> tuple[str, float] | None:
-    """Return the marker that fits much worse than the others, and its error in units of its noise."""
-    if len(errors) < 2:
+    """Return the marker that fits much worse than the others, and its error in units of its noise.
+
+    Two markers that contradict each other do not tell which one is wrong.
+    """
+    if len(errors) < 3:
         return None
     worst = max(errors, key=errors.__getitem__)
     others = [error for name, error in errors.items() if name != worst]
-    limit = _CONTRADICTED_MISFIT * max(float(np.median(others)), 1.0)
+    limit = _CONTRADICTED_MISFIT * max(median_low(others), 1.0)
     return (worst, errors[worst]) if errors[worst] > limit else None
 
 
@@ -203,9 +207,12 @@ def _describe(
 ) -> CarriedLab:
     """Return the cameras in the coordinates of the lab, with their errors in held-out frames."""
     # Errors above the noise have causes that are not known: the covariance covers them.
-    excess = max(1.0, float(np.median(list(misfits(fit).values()))))
-    fit = replace(fit, covariance=excess**2 * fit.covariance)
     frame = find_frame(fit, targets) if targets else first_camera(fit)
+    by_frame = (frame.chi2 / frame.freedom) ** 0.5 if frame.freedom > 0 and rest is not None else 1.0
+    excess = max(1.0, by_frame, *misfits(fit).values())
+    is_contradicted = excess > _CONTRADICTED_MISFIT
+    fit = replace(fit, covariance=excess**2 * fit.covariance)
+    frame = frame._replace(covariance=excess**2 * frame.covariance)
     errors_px = hold_out_halves(fit, lambda done, total: progress("hold out", done, total))
     # The size of the body scales all lengths about the places that are known.
     known_m = [np.zeros(3)] if rest is not None or not targets else [one.position_m for one in targets]
@@ -213,9 +220,14 @@ def _describe(
     excess_length = relative_length(fit, targets) if rest is None and len(targets) > 1 else 0.0
     scale_sigma = max(scale_sigma, abs(excess_length))
     in_lab = apply_frame(fit, frame, tilt_rad, scale_sigma, np.mean(known_m, axis=0))
-    in_lab = replace(in_lab, is_certain=bool(targets))
+    in_lab = replace(in_lab, is_certain=bool(targets) and not is_contradicted)
     names = [camera.name for camera in fit.observations.cameras]
     remarks = _remarks(frame, rest, names[0] if not targets else None)
+    if is_contradicted:
+        remarks += (
+            f"the corners contradict the shape of {body}, by {excess:.1f} times their noise: poses may be "
+            "wrong by centimetres, and the model is uncertain. Check poses and sides: ipsys calibrate-body",
+        )
     if abs(excess_length) > _ODD_LENGTH:
         more = (
             f"{100 * abs(excess_length):.1f} % {'farther apart' if excess_length > 0 else 'nearer together'}"

@@ -83,6 +83,31 @@ def test_wrong_markers_of_a_carried_body_are_named(ipsys: Ipsys, wand: CarriedWa
         assert camera["origin_m"] == pytest.approx(-true[:3, :3].T @ true[:3, 3], abs=0.01)
 
 
+def test_two_markers_that_contradict_each_other_widen_the_covariance(
+    ipsys: Ipsys, wand: CarriedWand, tmp_path: Path
+) -> None:
+    ids, sigmas_m = (0, 1), []
+    for shift_m in (0.0, 0.004):
+        markers = tuple(
+            replace(one, xyz_m=(one.xyz_m[0] + shift_m, *one.xyz_m[1:])) if one.id == 1 else one
+            for one in wand.rig.markers
+            if one.id in ids or one.robot is None
+        )
+        log = tmp_path / f"{shift_m}.mcap"
+        write_log(log, wand_messages(replace(wand, rig=replace(wand.rig, markers=markers))))
+        found = json.loads(ipsys("calibrate-lab", log, "--body", "wand", "--json").out)
+        named = any("the corners contradict the shape of wand" in remark for remark in found["remarks"])
+        assert named == (shift_m > 0)
+        with Session([log]) as session:
+            models = restore_joint(session.payloads([MODEL.topic_of("joint")])[-1])
+        assert all(model.is_certain != named for model in models.values())
+        sigmas_m.append(found["cameras"][1]["origin_sigmas_m"])
+        true = wand.camera_from_world["c1"]
+        errors_m = np.abs(found["cameras"][1]["origin_m"] + true[:3, :3].T @ true[:3, 3])
+        assert (errors_m < 3 * np.array(sigmas_m[-1])).all()
+    assert min(np.divide(*reversed(sigmas_m))) > 1.5
+
+
 def test_prints_that_contradict_measured_points_are_named(ipsys: Ipsys, tmp_path: Path) -> None:
     wand = carry_wand(7, count=2, duration_s=8.0, taped=True)
     markers = tuple(replace(one, length_m=1.01 * (one.length_m or 0.12)) for one in wand.rig.markers)

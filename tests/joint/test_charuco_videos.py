@@ -32,7 +32,7 @@ def test_frame_times_reduce_errors_on_real_images(data: Path, tmp_path: Path) ->
     assert timed["in_sample"]["rmse_px"] < 0.9
     assert timed["held_out"]["rmse_px"] < 1.5
     assert np.sqrt(np.mean(np.square(timed["square_errors_mm"]))) < 0.5
-    # Four webcams of one type read 720 rows in about 1/33 s.
+    # Each camera has its own estimate: 720 rows in about 1/33 s.
     assert all(30 < row_us < 55 for row_us in timed["row_times_us"])
     for measure in ("rmse_px", "median_px"):
         simultaneous, timed = (figures[model]["held_out"][measure] for model in ("simultaneous", "timed"))

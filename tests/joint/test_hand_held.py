@@ -168,7 +168,7 @@ def test_camera_that_shares_no_view_is_refused() -> None:
     observations = wave_board(moving=True)
     first, second, third = observations.sightings
     late = replace(third, times_s=third.times_s + 100.0)
-    with pytest.raises(FitError, match="camera c2: it never sees the board at the same time"):
+    with pytest.raises(FitError, match="camera c2: it never sees the body at the same time"):
         fit_hand_held(replace(observations, sightings=(first, second, late)), FIXED)
 
 

@@ -82,8 +82,8 @@ def chain_cameras(observations: Observations, views: list[Array]) -> list[Array]
                 camera.name for n, camera in enumerate(observations.cameras) if n not in cameras
             )
             raise FitError(
-                f"camera {names}: it never sees the board at the same time as the other cameras; show the "
-                "board to both"
+                f"camera {names}: it never sees the body at the same time as the other cameras; show the "
+                "body to both"
             )
         cameras[new] = _central_pose(pairs[known, new]) @ cameras[known]
     return [cameras[camera] for camera in range(len(views))]

@@ -22,6 +22,9 @@ from ipsys_log.errors import FitError
 from ipsys_log.messages import Array
 from ipsys_log.vision.lenses import undistort
 
+# The 90th percentile of chi2 of four corners, for each coordinate.
+_USUAL_CHI2 = 1.67
+
 
 def predict_errors(fit: JointFit, camera: int, sightings: Sightings) -> Array:
     """Return the reprojection errors of sightings, also of those that the fit did not use.
@@ -113,7 +116,8 @@ def corner_sigma(fit: JointFit) -> float:
 def misfits(fit: JointFit) -> dict[str, float]:
     """Return the errors of each part of the moving body, such as a marker, in units of its noise.
 
-    They are the roots of the median chi2 of a coordinate: about 0.9 if the part fits.
+    They are 1 for a part that fits. The robust loss hides a wrong part: some of its sightings are outliers,
+    and the others agree. So the tenth of the sightings with the largest errors decides.
     """
     parts: dict[str, list[Array]] = {}
     for factors in fit.problem.sightings:
@@ -123,7 +127,10 @@ def misfits(fit: JointFit) -> dict[str, float]:
             for body in np.unique(factors.sightings.body).tolist():
                 own = chi2[factors.sightings.body == body]
                 parts.setdefault(fit.observations.bodies[body].name, []).append(own)
-    return {name: float(np.sqrt(np.median(np.concatenate(own)))) for name, own in parts.items()}
+    return {
+        name: float(np.sqrt(np.percentile(np.concatenate(own), 90) / _USUAL_CHI2))
+        for name, own in parts.items()
+    }
 
 
 def distance_errors(fit: JointFit) -> Array:

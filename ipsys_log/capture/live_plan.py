@@ -261,7 +261,7 @@ def _wire(
         options = request.options(model.name if model else None)
         view = _LiveView(cameras, lenses, settings, inputs, model, imported=imported)
         plan = stage.plan(view, options)
-        if isinstance(plan, str) and arriving is not None:
+        if isinstance(plan, str) and (arriving is not None or not plan):
             inputs.update({channel: plan for channel in stage.writes if channel is not RUN_EVENTS})
             return
         assert isinstance(plan, Plan), f"{stage.name} cannot run live"

@@ -15,12 +15,14 @@ camera-frame    markers,            camera points     the run of its markers
 fit             camera points,      model             the model, ``poly``
                 measurements
 evaluate        the same, model     evaluation        the run of its model
+watch           markers, model      camera poses      the run of its model
 locate          camera points,      positions         the run of its model
-                model
+                model, camera poses
 fuse            positions           tracks, poses     the run of its positions
 ==============  ==================  ================  =====================================
 
-The model ``joint`` reads markers and intrinsics instead of camera points, in fit, evaluate and locate.
+The model ``joint`` reads markers and intrinsics instead of camera points, in fit, evaluate and locate. Only
+this model is watched.
 All stages read the rig; locate reads it only for models that need the height of a marker.
 :mod:`ipsys_log.engine` has the details: the plan of each stage (``graph``), and the search or creation of its
 run (``execute``). :mod:`ipsys_log.capture` moves frames from the cameras into the log (``recorder``), and
@@ -56,8 +58,8 @@ from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.known_contents import one_reading
 from ipsys_log.log.location import LogLocation
 from ipsys_log.messages import Message
-from ipsys_log.messages.channels import channel_of
-from ipsys_log.messages.events import CONTRADICTIONS
+from ipsys_log.messages.channels import CAMERA_POSES, channel_of
+from ipsys_log.messages.events import CONTRADICTIONS, WATCHED
 from ipsys_log.plain_text import shell_words
 from ipsys_log.sinks.sink import FanOut, Sink
 from ipsys_log.statistics.latency import Ledger
@@ -226,9 +228,10 @@ def live(
     if plan.reason:
         cameras.say(plan.reason)
     first = (*settings, *plan.copies(cameras.now_ns))
-    knocks = knock_events(plan.rig, cameras.add_event)
+    is_watched = any(CAMERA_POSES in wired.stage.writes for wired in plan.stages)
+    knocks = [] if is_watched else [knock_events(plan.rig, cameras.add_event)]
     with (
-        FanOut([cameras.positions, knocks, _contradictions(cameras.say), *sinks], cameras.add_event) as show,
+        FanOut([cameras.positions, *knocks, _contradictions(cameras.say), *sinks], cameras.add_event) as show,
         one_blas_thread(),
         open_recording(target, first, overwrite) as log,
         ExitStack() as resources,
@@ -321,10 +324,14 @@ def _put_through(
 
 
 def _contradictions(say: Callable[[str], None]) -> Sink:
-    """Return a sink that prints the contradictions between cameras and their calibrations."""
+    """Return a sink that prints the contradictions between cameras and their calibrations, and their moves.
+
+    The moves that the recorder notes are printed there.
+    """
 
     def print_text(message: Message) -> None:
-        if getattr(message.payload, "kind", None) in CONTRADICTIONS:
+        kind = getattr(message.payload, "kind", None)
+        if kind in CONTRADICTIONS or (kind in WATCHED and run_of_topic(message.topic) is not None):
             say(message.payload.text)
 
     return print_text

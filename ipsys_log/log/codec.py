@@ -166,6 +166,7 @@ PAYLOADS: dict[str, type] = {
         f"ipsys.v1.{payload.__name__}": payload
         for payload in (
             messages.CameraPoints,
+            messages.CameraPoses,
             messages.ClockEstimate,
             messages.Cut,
             messages.Evaluation,

@@ -72,6 +72,8 @@ from ipsys_log.messages.message import (
 from ipsys_log.messages.models import (
     CameraEvaluation,
     CameraModel,
+    CameraPose,
+    CameraPoses,
     Distance,
     ErrorStatistics,
     Evaluation,
@@ -139,6 +141,8 @@ __all__ = [
     "CameraModel",
     "CameraPoint",
     "CameraPoints",
+    "CameraPose",
+    "CameraPoses",
     "ChannelCut",
     "ChannelRead",
     "ChannelWritten",

@@ -14,7 +14,7 @@ from ipsys_log.messages.images import (
     RawImage,
     SkippedVideo,
 )
-from ipsys_log.messages.models import Evaluation, Measurement, Model
+from ipsys_log.messages.models import CameraPoses, Evaluation, Measurement, Model
 from ipsys_log.messages.rig import CameraCalibration, Rig
 from ipsys_log.messages.tracks import FrameTransforms, Positions, RobotPath, Tracks, WheelCommand
 
@@ -93,6 +93,9 @@ CAMERA_POINTS = Channel(
     name="camera_points", topic="/runs/{run}/cameras/{camera}/camera_points", payloads=(CameraPoints,)
 )
 MODEL = Channel(name="model", topic="/runs/{run}/model", payloads=(Model,), lasting=True)
+CAMERA_POSES = Channel(
+    name="camera_poses", topic="/runs/{run}/camera_poses", payloads=(CameraPoses,), lasting=True
+)
 EVALUATION = Channel(name="evaluation", topic="/runs/{run}/evaluation", payloads=(Evaluation,), lasting=True)
 POSITIONS = Channel(name="positions", topic="/runs/{run}/cameras/{camera}/positions", payloads=(Positions,))
 TRACKS = Channel(name="tracks", topic="/runs/{run}/tracks", payloads=(Tracks,))
@@ -105,8 +108,8 @@ RUN_EVENTS = Channel(name="run_events", topic="/runs/{run}/events", payloads=(Ev
 
 CHANNELS: tuple[Channel, ...] = (
     *(RIG, IMAGES, CALIBRATIONS, CLOCKS, MEASUREMENTS, EVENTS, LATENCY, TRUTH, PATHS, COMMANDS, CUTS, MERGES),
-    *(RECORD, MARKERS, ANNOTATIONS, CAMERA_POINTS, MODEL, EVALUATION, POSITIONS, TRACKS, POSES),
-    *(SMOOTHED_TRACKS, ESTIMATE, CALIBRATED_RIG, RUN_EVENTS),
+    *(RECORD, MARKERS, ANNOTATIONS, CAMERA_POINTS, MODEL, CAMERA_POSES, EVALUATION, POSITIONS, TRACKS),
+    *(POSES, SMOOTHED_TRACKS, ESTIMATE, CALIBRATED_RIG, RUN_EVENTS),
 )
 
 RIG_TOPIC = RIG.topic

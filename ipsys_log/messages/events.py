@@ -16,6 +16,12 @@ ASSUMED_MODEL = "assumed_lens_model"
 CALIBRATION_CONTRADICTED = "calibration_contradicted"
 # The kind of an event for a camera that was knocked during a live recording.
 CAMERA_MOVED = "camera_moved"
+# The kinds of events of a camera that moved slowly, of one whose new pose is in use, of a marker that was
+# moved on its robot or from its place, and of a clock that jumped.
+CAMERA_DRIFTED, CAMERA_REPAIRED = "camera_drifted", "camera_repaired"
+MARKER_MOVED, CLOCK_JUMPED = "marker_moved", "clock_jumped"
+# The kinds of events of the watch over the cameras.
+WATCHED = frozenset((CAMERA_MOVED, CAMERA_DRIFTED, CAMERA_REPAIRED, MARKER_MOVED, CLOCK_JUMPED))
 # The kind of an event for a model whose cameras place the same robot far apart.
 MODEL_CONTRADICTED = "model_contradicted"
 # The kinds of events for a marker whose corners contradict its height in the rig, and for a tilted marker

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from ipsys_log.messages.message import Floats, Mat33, TimeNs, Vec3
+from ipsys_log.messages.message import Floats, Mat33, Mat66, TimeNs, Vec3
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,3 +215,36 @@ class Evaluation:
     suspects: tuple[Suspect, ...] = ()
     excluded: tuple[Suspect, ...] = ()
     with_excluded: tuple[CameraEvaluation, ...] = ()
+
+
+# The states of a camera that has moved.
+MOVED, SUSPECTED, CLEARED = "moved", "suspected", "cleared"
+REPAIRED, PARTLY = "repaired", "partly"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraPose:
+    """The pose of a camera that has moved since the calibration.
+
+    ``state`` is ``moved``: positions keep the old pose, with a larger covariance; ``suspected``: this camera
+    or another one has moved; ``cleared``: it was another one; ``repaired``: positions use this pose; or
+    ``partly``: they use it, but only a part of the motion is known. ``since`` is the time of the motion.
+    ``covariance`` is that of a turn about the axes of the camera (rad) and a shift in the world (m), from
+    ``deviations`` mean deviations of markers.
+    """
+
+    camera: str
+    state: str
+    since: TimeNs
+    position_m: Vec3
+    camera_from_world: Mat33
+    covariance: Mat66
+    deviations: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraPoses:
+    """The poses of cameras that have moved, as they are known at ``timestamp``; others keep theirs."""
+
+    timestamp: TimeNs
+    poses: tuple[CameraPose, ...]

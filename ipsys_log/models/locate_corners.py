@@ -1,21 +1,38 @@
 """Positions of markers by the joint model: the step of a frame, and the fitted model of the Python API."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ipsys_log.calibration.joint.locate import LevelPositions, corner_covariances, locate_markers
+from ipsys_log.calibration.joint.locate import (
+    LevelPositions,
+    corner_covariances,
+    exposure_offset_ns,
+    locate_markers,
+)
 from ipsys_log.calibration.joint.locate_poses import Poses, hold_heights, locate_poses
 from ipsys_log.calibration.joint.model import JointModel
-from ipsys_log.calibration.joint.payload import restore_joint
+from ipsys_log.calibration.joint.payload import add_pose_modes, restore_joint
 from ipsys_log.calibration.joint.settings import JointSettings
 from ipsys_log.errors import IpsysError
-from ipsys_log.messages import Array, Marker, Markers, Message, Model, Position, Positions, Rig
+from ipsys_log.messages import (
+    Array,
+    CameraPose,
+    CameraPoses,
+    Marker,
+    Markers,
+    Message,
+    Model,
+    Position,
+    Positions,
+    Rig,
+)
+from ipsys_log.messages.models import MOVED, PARTLY, SUSPECTED
 from ipsys_log.models.body_positions import BodyLocator
 from ipsys_log.models.locate_points import ContradictedHeights, HeightSighting
-from ipsys_log.units import NS_PER_S
 
 _HEIGHT_SIGMA_M = JointSettings().robot_height_sigma_m
 # A marker that is not where its corners say that it is has larger residuals. One in a million is larger by
@@ -49,11 +66,16 @@ class LocateCorners:
     full pose: at this height if only its tilt is unusual, otherwise at the height by its corners, which an
     event names. Markers without a height get their full pose. Bodies that are not level have one position
     for all their markers. Reference markers are no robots: they have no positions.
+
+    The poses of cameras that have moved since the calibration replace those of the model. A camera whose pose
+    is not known has a larger covariance, and none of its positions is inside.
     """
 
     def __init__(self, model: Model) -> None:
         self._name = model.name
-        self._cameras = restore_joint(model)
+        self._fitted = restore_joint(model)
+        self._cameras = dict(self._fitted)
+        self._poses: dict[str, CameraPose] = {}
         self._rig: Rig | None = None
         self._heights = ContradictedHeights(model)
         self._bodies = BodyLocator(self._cameras)
@@ -63,6 +85,8 @@ class LocateCorners:
             self._rig = message.payload
             self._bodies.use_rig(self._rig)
             return
+        if isinstance(message.payload, CameraPoses):
+            self._use_poses(message.payload)
         if not isinstance(message.payload, Markers):
             return
         camera = self._cameras.get(str(message.camera))
@@ -82,8 +106,29 @@ class LocateCorners:
                     positions.append(result)
                 else:
                     yield result
+            if self._is_unknown(str(message.camera)):
+                # The filter must not average this error over frames: it counts as noise.
+                positions = [replace(p, inside=False, noise_m2=p.covariance_m2) for p in positions]
             positions.sort(key=lambda position: position.id)
             yield Positions(time_ns, tuple(positions))
+
+    def _is_unknown(self, camera: str) -> bool:
+        """Return whether the camera has moved, or may have, and its new pose is not known."""
+        return camera in self._poses and self._poses[camera].state in (MOVED, SUSPECTED, PARTLY)
+
+    def _use_poses(self, message: CameraPoses) -> None:
+        """Use the poses of cameras that have moved, with their uncertainty, from now on."""
+        self._poses.update({pose.camera: pose for pose in message.poses if pose.camera in self._fitted})
+        moved = {
+            name: replace(joint, origin_m=pose.position_m, camera_from_world=pose.camera_from_world)
+            if (pose := self._poses.get(name)) is not None
+            else joint
+            for name, joint in self._fitted.items()
+        }
+        spreads = {name: pose.covariance for name, pose in self._poses.items() if pose.covariance.any()}
+        self._cameras.update(add_pose_modes(moved, spreads))
+        if self._rig is not None:
+            self._bodies.use_rig(self._rig)
 
     def _locate(self, camera: JointModel, markers: Sequence[Marker]) -> list[_Located]:
         if markers and self._rig is None:
@@ -171,9 +216,8 @@ def _corners(markers: Sequence[Marker]) -> tuple[Array, Array]:
 
 
 def _time_offset_ns(camera: JointModel, marker: Marker) -> int | None:
-    """Return the time from the stamp of the frame to the exposure of the marker, by the common clock."""
-    rows = float(marker.corners_px[:, 1].mean())
-    offset_ns = (marker.time_offset_ns or 0) + round((rows * camera.row_time_s + camera.clock_s) * NS_PER_S)
+    """Return the time from the stamp of the frame to the exposure of the marker; None for both at once."""
+    offset_ns = exposure_offset_ns(camera, marker)
     return offset_ns if offset_ns or marker.time_offset_ns is not None else None
 
 

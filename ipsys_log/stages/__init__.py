@@ -128,6 +128,12 @@ SEED = StageParameter(
     default=0,
     least=0,
 )
+SELF_CALIBRATE = StageParameter(
+    name="self_calibrate",
+    help="Estimate the new pose of a camera that has moved, and use it.",
+    kind=bool,
+    default=False,
+)
 
 # Each stage comes after the stages that write its channels.
 ENTRIES: tuple[StageEntry, ...] = (
@@ -149,6 +155,11 @@ ENTRIES: tuple[StageEntry, ...] = (
     StageEntry(
         name="evaluate",
         help="Evaluate models: their errors, the learning curve and outliers of the measurements.",
+    ),
+    StageEntry(
+        name="watch",
+        help="Compare the cameras with one another and with their past (model joint).",
+        parameters=(SELF_CALIBRATE,),
     ),
     StageEntry(name="locate", help="Apply a model: compute world positions from each camera."),
     StageEntry(name="fuse", help="Filter the positions of all cameras into one track per robot."),

@@ -100,7 +100,7 @@ def test_channel_is_identified_by_topic_and_payload(
 
 def test_stages_until_gives_the_needed_stages() -> None:
     assert names("detect") == ["detect"]
-    assert names("locate") == ["detect", "camera-frame", "fit", "locate"]
+    assert names("locate") == ["detect", "camera-frame", "fit", "watch", "locate"]
     assert names("evaluate") == ["detect", "camera-frame", "fit", "evaluate"]
     # No other stage reads the results of fuse, and of evaluate, which comes before it.
     assert names("fuse") == names(None)

@@ -17,7 +17,7 @@ from ipsys_log.app.cli.console import say
 from ipsys_log.app.report.files import check_figure_file, check_figures
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.location import LogLocation, LogUrl, parse_location
-from ipsys_log.stages import CORNERS, METHOD, StageParameter
+from ipsys_log.stages import CORNERS, METHOD, SELF_CALIBRATE, StageParameter
 
 if TYPE_CHECKING:
     LogList = list[LogLocation]
@@ -237,6 +237,7 @@ Calibrations = Annotated[
 ]
 Corners = stage_option(CORNERS)[0]
 Method = stage_option(METHOD)[0]
+SelfCalibrate = stage_option(SELF_CALIBRATE)[0]
 Only = Annotated[
     list[str] | None, setting("--camera", "NAME", "Use only this camera of the rig; repeat it for several.")
 ]

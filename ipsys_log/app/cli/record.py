@@ -235,6 +235,7 @@ def live(
     calibration: cli.Calibrations = None,
     corners: cli.Corners = None,
     method: cli.Method = "perimeter",
+    self_calibrate: cli.SelfCalibrate = False,
     view: View = False,
     web: Web = False,
     web_port: WebPort = None,
@@ -266,7 +267,10 @@ def live(
     lab = prepare_lab(rig, camera, calibration)
     check_target(output, force, [*lab.files, *([(MODEL, model_from)] if model_from else [])])
     models = tuple(dict.fromkeys(model or ()))
-    request = Request(models=models, model_from=model_from, corners=corners, method=method)
+    parameters = {"self_calibrate": "yes"} if self_calibrate else {}
+    request = Request(
+        models=models, model_from=model_from, corners=corners, method=method, parameters=parameters
+    )
     for line in check_start(lab.rig, lab.names, lab.lenses, request, None):
         warn(line)
     planned = plan_dashboard(web, streams["host"], web_port, request)

@@ -13,7 +13,8 @@ import numpy as np
 
 from ipsys_log.calibration.joint.model import JointModel
 from ipsys_log.calibration.lens_models import project_with_slopes
-from ipsys_log.messages import Array
+from ipsys_log.messages import Array, Marker
+from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.lenses import undistort
 from ipsys_log.vision.markers import marker_corners
 from ipsys_log.vision.poses import cross, level_turns
@@ -84,7 +85,7 @@ def locate_markers(
     LevelPositions : those of the markers.
     """
     inward = edge_motion(corners_px)
-    points_m, headings_rad, floor_slopes, floor_modes = _start(model, corners_px, inward, heights_m)
+    points_m, headings_rad, floor_slopes, floor_modes = start_level(model, corners_px, inward, heights_m)
     arms_m = marker_arms(level_turns(headings_rad), lengths_m * model.scale)
     now = linearise_corners(model, corners_px, inward, points_m, arms_m)
     by_height = now.by_pose[:, :, 2:3]
@@ -117,6 +118,12 @@ def locate_markers(
     return LevelPositions(
         points_m, headings_rad, covariances, chi2, modes_m, noise_m2, np.sqrt(spread[:, 2, 2])
     )
+
+
+def exposure_offset_ns(model: JointModel, marker: Marker) -> int:
+    """Return the time from the stamp of the frame to the exposure of a marker, by the common clock, in ns."""
+    rows = float(marker.corners_px[:, 1].mean())
+    return (marker.time_offset_ns or 0) + round((rows * model.row_time_s + model.clock_s) * NS_PER_S)
 
 
 class CornerSlopes(NamedTuple):
@@ -191,7 +198,7 @@ def linearise_corners(
     )
 
 
-def _start(
+def start_level(
     model: JointModel, corners_px: Array, inward: Array, heights_m: Array
 ) -> tuple[Array, Array, Array, Array]:
     """Return points (n, 3) and headings (n,) from the rays of the corners; slopes and modes of the floor."""

@@ -16,7 +16,7 @@ from ipsys_log.calibration.joint.model import JointModel, build_models
 from ipsys_log.errors import IpsysError
 from ipsys_log.messages import Array, CameraCalibration, CameraModel, Model, Pair, Parameter
 from ipsys_log.vision.lenses import DISTORTION_MODELS
-from ipsys_log.vision.poses import rotation
+from ipsys_log.vision.poses import rotation, rotation_vector
 
 # The name of the model in commands and logs.
 JOINT = "joint"
@@ -98,18 +98,39 @@ def mend_poses(model: Model, changes: Mapping[str, PoseChange], time_ns: int) ->
     IpsysError
         The model is not complete.
     """
-    moved = [camera.camera for camera in model.cameras if camera.camera in changes]
-    joints = restore_joint(model)
+    joints = {
+        name: move_camera(joint, changes[name].motion) if name in changes else joint
+        for name, joint in restore_joint(model).items()
+    }
+    joints = add_pose_modes(joints, {name: change.covariance for name, change in changes.items()})
+    return replace(store_joint(model, joints), timestamp=time_ns)
+
+
+def add_pose_modes(
+    joints: Mapping[str, JointModel], covariances: Mapping[str, Array]
+) -> dict[str, JointModel]:
+    """Return cameras whose poses have further errors with covariances (6, 6): six modes for each of these."""
+    moved = [name for name in joints if name in covariances]
+    wider = {}
     for name, joint in joints.items():
         more = np.zeros((len(joint.modes), _POSE * len(moved)))
-        if name in changes:
-            motion, covariance = changes[name]
+        if name in covariances:
             first = _POSE * moved.index(name)
-            more[:_POSE, first : first + _POSE] = np.linalg.cholesky(covariance)
-            turned = rotation(motion[:3]) @ joint.camera_from_world
-            joints[name] = replace(joint, camera_from_world=turned, origin_m=joint.origin_m + motion[3:])
-        joints[name] = replace(joints[name], modes=np.hstack([joint.modes, more]))
-    return replace(store_joint(model, joints), timestamp=time_ns)
+            more[:_POSE, first : first + _POSE] = np.linalg.cholesky(covariances[name])
+        wider[name] = replace(joint, modes=np.hstack([joint.modes, more]))
+    return wider
+
+
+def move_camera(camera: JointModel, motion: Array) -> JointModel:
+    """Return a camera after a motion (6,): a turn about its axes, and a shift in the world."""
+    turned = rotation(motion[:3]) @ camera.camera_from_world
+    return replace(camera, camera_from_world=turned, origin_m=camera.origin_m + motion[3:])
+
+
+def find_motion(before: JointModel, after: JointModel) -> Array:
+    """Return the motion (6,) of a camera, as :func:`move_camera` takes it."""
+    turn_rad = rotation_vector(after.camera_from_world @ before.camera_from_world.T)
+    return np.concatenate([turn_rad, after.origin_m - before.origin_m])
 
 
 def _restore(camera: CameraModel, shared: Sequence[Parameter]) -> JointModel:

@@ -1,18 +1,36 @@
 """Reading of logs for the drift of their cameras, with the checks of the input."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
+
+from ipsys_log.calibration.joint.model import JointModel
+from ipsys_log.calibration.joint.payload import find_motion, restore_joint
 from ipsys_log.engine.mended_model import find_model
 from ipsys_log.engine.provenance import newest_run
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.location import LogLocation
-from ipsys_log.messages import Rig
+from ipsys_log.messages import CameraPose, CameraPoses, Message, Model, Rig
 from ipsys_log.messages.channels import MARKERS, RIG
+from ipsys_log.messages.events import MARKER_MOVED
+from ipsys_log.messages.models import MOVED
+from ipsys_log.models.table import reads_corners
 from ipsys_log.plain_text import shell_words
-from ipsys_log.statistics.camera_moves import DriftLog, LabDrift, find_drift, image_sizes, read_windows
-from ipsys_log.statistics.drift import Motion
+from ipsys_log.stages.watch import WatchCameras
+from ipsys_log.statistics.camera_moves import (
+    CameraState,
+    DriftLog,
+    LabDrift,
+    MarkerMove,
+    Move,
+    find_drift,
+    image_sizes,
+    read_windows,
+)
+from ipsys_log.statistics.deviations import STEP_NS
+from ipsys_log.statistics.drift import DriftBaseline, Motion
 from ipsys_log.statistics.floor_cameras import read_floor_cameras
 from ipsys_log.vision.poses import PosedCamera
 
@@ -68,6 +86,8 @@ def read_drift(
         No rig has reference markers, a log has no markers or is of other cameras, or no log has a model.
     """
     logs, remarks = _order(paths, baseline)
+    if not any(_has_references(path, rig) for path in logs):
+        return _watch_logs(logs, model_from, rig, progress, remarks)
     read = _read_logs(logs, rig, progress, remarks)
     first = read[0]
     kept = [log.path for log in read]
@@ -83,6 +103,100 @@ def read_drift(
     if len(read) == 1:
         remarks.append("one log shows only moves during its recording; add earlier logs")
     return DriftReading(drift, kept, [log.name for log in windows], model, source, remarks)
+
+
+def _has_references(path: LogLocation, rig: Rig | None) -> bool:
+    with Session([path]) as session:
+        rigs = [rig] if rig is not None else session.payloads(session.topics(RIG))
+    return any(one.reference_markers for one in rigs)
+
+
+def _watch_logs(
+    paths: Sequence[LogLocation],
+    model_from: LogLocation | None,
+    rig: Rig | None,
+    progress: Callable[[int, int], None],
+    remarks: list[str],
+) -> DriftReading:
+    """Find the moves of the cameras from robots that drive, without reference markers."""
+    model, source, cameras = _find_joint_model([model_from] if model_from else paths, _start_ns(paths[0]))
+    watch, fitted, drift = WatchCameras(model, True), restore_joint(model), LabDrift()
+    drift.baselines = {name: DriftBaseline(one, np.empty((0, 3)), {}, {}) for name, one in cameras.items()}
+    names, before = list[str](), ("", 0)
+    for number, path in enumerate(paths):
+        progress(number, len(paths))
+        name = path.name if [other.name for other in paths].count(path.name) == 1 else str(path)
+        names.append(name)
+        poses: dict[tuple[int, str], CameraPose] = {}
+        with Session([path]) as session:
+            start_ns = session.start_ns
+            for message in _marker_messages(session, rig):
+                for payload in watch(message):
+                    if isinstance(payload, CameraPoses):
+                        poses.update(
+                            {(one.since, one.camera): one for one in payload.poses if one.state == MOVED}
+                        )
+                    elif payload.kind == MARKER_MOVED:
+                        drift.marker_moves.append(MarkerMove(payload.marker_id, payload.timestamp, name))
+        end_ns = message.publish_time_ns
+        states = {one: _motion(watch, fitted, one) for one in sorted(cameras)}
+        drift.states += [CameraState(one, name, end_ns, motion) for one, motion in states.items()]
+        for (since_ns, camera), _ in sorted(poses.items()):
+            motion, is_between = states[camera], bool(before[0]) and since_ns < start_ns + STEP_NS
+            if motion is not None:
+                first = before if is_between else (name, since_ns)
+                drift.moves.append(Move(camera, first[1], since_ns + STEP_NS, first[0], name, motion))
+        before = name, end_ns
+    progress(len(paths), len(paths))
+    return DriftReading(drift, list(paths), names, model.name, source, remarks)
+
+
+def _marker_messages(session: Session, rig: Rig | None) -> Iterator[Message]:
+    """Yield the rig and the markers of a log.
+
+    Raises
+    ------
+    IpsysError
+        The log has no markers.
+    """
+    run, start_ns = newest_run(session, MARKERS), session.start_ns
+    if run is None:
+        raise IpsysError(
+            f"{session}: has no detected markers; to detect them: "
+            f"ipsys replay {shell_words(*session.paths)} --until detect"
+        )
+    rigs = [rig] if rig is not None else session.payloads(session.topics(RIG))[:1]
+    yield from (Message(RIG.topic, start_ns, start_ns, one) for one in rigs)
+    later = [] if rig is not None else session.topics(RIG)
+    yield from session.messages([*later, *session.topics(MARKERS, run)])
+
+
+def _motion(watch: WatchCameras, fitted: Mapping[str, JointModel], camera: str) -> Motion | None:
+    """Return the motion of a camera since the calibration; None if it has no frame."""
+    floor = watch.floor_of(camera)
+    if floor is None:
+        return None
+    model, covariance = watch.poses()[camera]
+    motion = find_motion(fitted[camera], model)
+    shift_m, sigma_m = floor.mean_shift(motion), floor.mean_sigma(covariance)
+    evidence = float(motion @ np.linalg.solve(covariance, motion))
+    return Motion(motion, covariance, shift_m, sigma_m, (), (), False, evidence, None)
+
+
+def _find_joint_model(
+    paths: Sequence[LogLocation], until_ns: int
+) -> tuple[Model, tuple[LogLocation, str], dict[str, PosedCamera]]:
+    """Return the newest joint model of some logs, its source, and its cameras."""
+    for path in paths:
+        with Session([path]) as session:
+            found = find_model(session, until_ns)
+            lenses = {camera: session.payloads([topic])[-1] for camera, topic in session.calibrations.items()}
+        if found is not None and reads_corners(found[0].name):
+            return found[0], (path, found[1]), read_floor_cameras(found[0], lenses)
+    raise IpsysError(
+        f"{paths[0]}: its rig has no reference markers, and no log has the model joint; calibrate with "
+        "ipsys calibrate-lab and give this log with --model-from, or add [[reference_markers]] to lab.toml"
+    )
 
 
 def _order(paths: Sequence[LogLocation], baseline: LogLocation | None) -> tuple[list[LogLocation], list[str]]:

@@ -38,7 +38,11 @@ _ADVICE = {
     events.CALIBRATION_CONTRADICTED: (
         "correct lab.toml, or give the file with --calibration CAMERA=calibration.yaml"
     ),
-    events.CAMERA_MOVED: "calibrate the camera again, or run ipsys drift",
+    events.CAMERA_MOVED: "run ipsys replay --self-calibrate, or calibrate the camera again",
+    events.CAMERA_DRIFTED: "run ipsys replay --self-calibrate, or calibrate the camera again",
+    events.CAMERA_REPAIRED: "the positions use the new pose",
+    events.CLOCK_JUMPED: "start the camera again",
+    events.MARKER_MOVED: "measure its height, and correct lab.toml",
     events.MODEL_CONTRADICTED: "apply a model of this lab: ipsys replay LOG --model-from calibration.mcap",
     "frames_dropped": "record on a faster disk",
     "frames_missed": "reduce the rate or the size of the images, or use another USB bus",

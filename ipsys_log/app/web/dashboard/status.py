@@ -9,8 +9,8 @@ from typing import Any
 from ipsys_log.capture.disk import DiskRoom
 from ipsys_log.capture.frames import CameraState
 from ipsys_log.capture.live_check import FrameCheck
-from ipsys_log.messages import CAMERA_MOVED, FRAME_SKIPPED, STAMP_UNRELIABLE, Event, Latency
-from ipsys_log.messages.events import OPERATOR_KINDS
+from ipsys_log.messages import FRAME_SKIPPED, STAMP_UNRELIABLE, Event, Latency
+from ipsys_log.messages.events import OPERATOR_KINDS, WATCHED
 from ipsys_log.plain_text import plain_text
 from ipsys_log.sinks.streams.opening import Stream
 from ipsys_log.statistics.latency import latency_percentiles, step_times_s
@@ -33,7 +33,7 @@ _ERRORS = frozenset(
 # The recording is complete, but a part of it needs attention.
 _WARNINGS = frozenset(
     (
-        *(CAMERA_MOVED, FRAME_SKIPPED, STAMP_UNRELIABLE, "ambiguous_marker", "camera_size"),
+        *(*WATCHED, FRAME_SKIPPED, STAMP_UNRELIABLE, "ambiguous_marker", "camera_size"),
         *("corrupt_frame", "frames_missed", "mirrored_camera", "no_keyframe", "no_keyframes"),
         *("model_contradicted", "other_prints", "sink_dropped", "wrong_size"),
     )

@@ -1,0 +1,305 @@
+"""The watch over calibrated cameras: a sudden motion of one is noticed, named and estimated.
+
+A camera that was knocked changes its deviations at all places at once, as six unknowns explain. A marker that
+was moved on its robot changes those of one robot only, a reference marker that was moved those of one
+marker, and a clock those along the velocities. The watch tests all of these causes over the last seconds,
+with each possible start (generalised likelihood ratio), and compares the best with a small motion of the same
+kind, which temperature can cause.
+
+References
+----------
+Basseville and Nikiforov, Detection of abrupt changes, 1993, sect. 2.4.3: unknown change time and magnitude.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from ipsys_log.calibration.joint.model import JointModel
+from ipsys_log.calibration.lens_models import project_points
+from ipsys_log.messages import Array
+from ipsys_log.statistics.deviations import REFERENCE, Deviation
+from ipsys_log.statistics.level_sightings import SeenMarkers, observe_level
+from ipsys_log.statistics.usual_deviations import UsualDeviations
+from ipsys_log.vision.markers import marker_corners
+
+# Steps whose deviations are tested; older ones become usual.
+TESTED_STEPS = 20
+# Standard deviations of motions that are tried, the usual ones of temperature first. A camera: turn about
+# each axis in rad, and shift along each axis in m;
+_CAMERA_SIZES = ((1e-4, 1.5e-4), (1e-3, 2e-3), (5e-3, 5e-3), (3e-2, 1e-2))
+# the height of a marker on its robot in m; a reference marker: shift in m, and turn in rad; a clock in s.
+_HEIGHT_SIZES_M = (3e-4, 2e-3, 1e-2, 5e-2)
+_REFERENCE_SIZES = ((1.5e-4, 1e-3), (5e-3, 2e-2), (5e-2, 0.3))
+_CLOCK_SIZES_S = (2e-4, 5e-3, 5e-2)
+# Standard deviation of the deviations of a marker that is carried, each by itself, in m and rad.
+_CARRIED = 0.01
+# Logarithm of the likelihood ratio to a usual change, from which on a change is reported,
+_SURE = 10.0
+# and by which the best cause exceeds all others before it alone is named.
+_LEAD = 10.0
+# Smaller changes are left: mean shift of the floor map, height of a marker, motion of a reference marker in
+# m, and time of a clock in s.
+LEAST_SHIFT_M, _LEAST_HEIGHT_M, _LEAST_REFERENCE_M, _LEAST_CLOCK_S = 0.0012, 0.0015, 0.002, 0.0005
+# An outlier among the deviations of a repair counts less from this many standard deviations on.
+_HUBER = 4.0
+# Information on the motion of a camera before its repair.
+_REPAIR_PRIOR = np.diag(np.repeat([1 / 3e-2, 1 / 1e-2], 3) ** 2)
+# The floor that a camera sees is within this multiple of its height; distance of the nodes on it.
+_REACH, _NODES_M = 2.0, 0.3
+_MOTION = 6
+
+
+class Cause(NamedTuple):
+    """A cause of a change, and its camera or marker id.
+
+    The kind is ``camera``, ``robot`` (another height of its marker), ``carried`` (a marker that is not on a
+    robot), ``reference`` or ``clock``.
+    """
+
+    kind: str
+    name: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evidence:
+    """The log likelihood of a cause in a step: information (p, p), gradient (p,), constant of a parabola."""
+
+    information: Array
+    gradient: Array
+    constant: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Finding:
+    """A cause with the start of the change that explains the deviations best.
+
+    Attributes
+    ----------
+    cause : what has changed.
+    first : the number of the first step after the change.
+    evidence : log of the likelihood ratio to no change; ``excess``: to a usual change.
+    estimate, covariance : (p,) and (p, p), the change.
+    """
+
+    cause: Cause
+    first: int
+    evidence: float
+    excess: float
+    estimate: Array
+    covariance: Array
+
+
+def gather_evidence(
+    usual: UsualDeviations, deviations: Sequence[Deviation], time_ns: int, without: Collection[str] = ()
+) -> dict[Cause, Evidence]:
+    """Return the evidence for each cause in the deviations of a step.
+
+    Parameters
+    ----------
+    usual : the usual deviations; places that are not known have no evidence.
+    deviations : of the step, at ``time_ns``.
+    without : cameras that are left out.
+    """
+    rows: dict[Cause, list[tuple[Array, Array, Array]]] = {}
+    for one in deviations:
+        compared = None if set(one.cameras) & set(without) else usual.compare(one, time_ns)
+        if compared is not None:
+            for cause, slopes in _causes(one):
+                rows.setdefault(cause, []).append((slopes, *compared))
+    evidence = {cause: _sum_evidence(own) for cause, own in rows.items()}
+    carried = {
+        Cause("carried", cause.name): Evidence(np.zeros((0, 0)), np.zeros(0), sum(map(_carried, own)))
+        for cause, own in rows.items()
+        if cause.kind == "robot"
+    }
+    return evidence | carried
+
+
+def _causes(one: Deviation) -> Iterator[tuple[Cause, Array]]:
+    """Yield the causes of a deviation, with its slopes (k, p) by their changes."""
+    for camera, slopes in one.slopes.items():
+        yield Cause("camera", camera), slopes
+    yield Cause("reference" if one.kind is REFERENCE else "robot", str(one.marker_id)), one.by_marker
+    if one.by_clock is not None:
+        yield Cause("clock", one.cameras[0]), -one.by_clock
+        yield Cause("clock", one.cameras[1]), one.by_clock
+
+
+def _carried(row: tuple[Array, Array, Array]) -> float:
+    """Return the log likelihood ratio of a deviation with an error of its own, to one without."""
+    _, difference, variance = row
+    wider = variance + _CARRIED**2
+    return float((difference**2 * (1 / variance - 1 / wider) - np.log(wider / variance)).sum()) / 2
+
+
+def _sum_evidence(rows: Sequence[tuple[Array, Array, Array]]) -> Evidence:
+    slopes, differences, variances = (np.concatenate(column) for column in zip(*rows, strict=True))
+    weighted: Array = slopes / variances[:, None]
+    return Evidence(slopes.T @ weighted, weighted.T @ differences)
+
+
+def find_causes(steps: Sequence[Mapping[Cause, Evidence]]) -> list[Finding]:
+    """Return a finding for each cause, the most likely one first.
+
+    Parameters
+    ----------
+    steps : the evidence of successive steps; a change lasts from one of them to the last.
+    """
+    findings = []
+    for cause in sorted({cause for step in steps for cause in step}):
+        own = [(number, step[cause]) for number, step in enumerate(steps) if cause in step]
+        information = np.cumsum([one.information for _, one in reversed(own)], axis=0)
+        gradient = np.cumsum([one.gradient for _, one in reversed(own)], axis=0)
+        constant = np.cumsum([one.constant for _, one in reversed(own)])
+        starts = [number for number, _ in reversed(own)]
+        if cause.kind == "carried":
+            best = int(constant.argmax())
+            zero = float(constant[best])
+            findings.append(Finding(cause, starts[best], zero, zero, np.zeros(0), np.zeros((0, 0))))
+        else:
+            findings.append(_best_start(cause, information, gradient, starts))
+    return sorted(findings, key=lambda one: -one.evidence)
+
+
+def _sizes(cause: Cause) -> list[Array]:
+    """Return the standard deviations (p,) of the changes that are tried, the usual ones first."""
+    if cause.kind == "camera":
+        return [np.repeat(size, 3) for size in _CAMERA_SIZES]
+    if cause.kind == "reference":
+        return [np.repeat(size, 3) for size in _REFERENCE_SIZES]
+    return [np.array([size]) for size in (_CLOCK_SIZES_S if cause.kind == "clock" else _HEIGHT_SIZES_M)]
+
+
+def _best_start(cause: Cause, information: Array, gradient: Array, starts: Sequence[int]) -> Finding:
+    """Return the finding with the best start, from the sums over the steps since each start."""
+    usual: Array | None = None
+    best: Finding | None = None
+    for sizes in _sizes(cause):
+        scaled = sizes[:, None] * information * sizes + np.eye(len(sizes))
+        pulled = gradient * sizes
+        solved = np.linalg.solve(scaled, pulled[..., None])[..., 0]
+        ratios = ((pulled * solved).sum(axis=1) - np.linalg.slogdet(scaled)[1]) / 2
+        if usual is None:
+            usual = np.maximum(ratios, 0.0)
+            continue
+        row = int(ratios.argmax())
+        if best is None or ratios[row] > best.evidence:
+            covariance = sizes[:, None] * np.linalg.inv(scaled[row]) * sizes
+            excess = float(ratios[row] - usual[row])
+            estimate = sizes * solved[row]
+            best = Finding(cause, starts[row], float(ratios[row]), excess, estimate, covariance)
+    assert best is not None
+    return best
+
+
+@dataclass(slots=True, eq=False)
+class Repair:
+    """The estimate of the motion of a camera from all deviations since it was named.
+
+    Attributes
+    ----------
+    motion : (6,), from the pose that the deviations refer to.
+    information, gradient, squares : the log likelihood of a motion, as a parabola.
+    count, values : number of deviations, and of their values.
+    """
+
+    motion: Array = field(default_factory=lambda: np.zeros(_MOTION))
+    information: Array = field(default_factory=lambda: np.zeros((_MOTION, _MOTION)))
+    gradient: Array = field(default_factory=lambda: np.zeros(_MOTION))
+    squares: float = 0.0
+    count: int = 0
+    values: int = 0
+
+    def add(self, usual: UsualDeviations, deviations: Sequence[Deviation], camera: str, time_ns: int) -> None:
+        """Add the deviations of a step; outliers count less."""
+        for one in deviations:
+            compared = usual.compare(one, time_ns) if camera in one.cameras else None
+            if compared is None:
+                continue
+            difference, variance = compared
+            slopes = one.slopes[camera]
+            # The motion so far has its own uncertainty: it does not make an outlier.
+            spread = variance + ((slopes @ self.covariance) * slopes).sum(axis=1)
+            square = float(((difference - slopes @ self.motion) ** 2 / spread).mean())
+            share = min(1.0, _HUBER / np.sqrt(square)) if square > 0 else 1.0
+            weighted = share * slopes / variance[:, None]
+            self.information = self.information + slopes.T @ weighted
+            self.gradient = self.gradient + weighted.T @ difference
+            self.squares += share * float((difference**2 / variance).sum())
+            self.count, self.values = self.count + 1, self.values + len(difference)
+        self.motion = self.covariance @ self.gradient
+
+    def rebase(self) -> None:
+        """Refer to the pose with the motion so far from now on."""
+        self.squares -= float(self.motion @ (2 * self.gradient - self.information @ self.motion))
+        self.gradient = self.gradient - self.information @ self.motion
+        self.motion = np.zeros(_MOTION)
+
+    @property
+    def covariance(self) -> Array:
+        """The covariance (6, 6) of the motion."""
+        return np.asarray(np.linalg.inv(self.information + _REPAIR_PRIOR))
+
+    @property
+    def misfit(self) -> float:
+        """The mean square of the residuals: near 1 if a motion of the camera explains the deviations."""
+        left = self.squares - float(self.motion @ (2 * self.gradient - self.information @ self.motion))
+        return max(left, 0.0) / self.values if self.values else 1.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ViewedFloor:
+    """The floor that a camera sees: slopes (n, 2, 6) of positions there by a motion of the camera."""
+
+    slopes: Array
+
+    @classmethod
+    def of_camera(cls, model: JointModel, width: int, height: int, length_m: float) -> ViewedFloor:
+        """Return the floor in an image of ``width`` x ``height`` px, as level markers would show it."""
+        reach_m = _REACH * float(model.origin_m[2])
+        steps_m = np.arange(-reach_m, reach_m, _NODES_M)
+        nodes_m = np.stack(np.meshgrid(steps_m, steps_m), axis=-1).reshape(-1, 1, 2) + model.origin_m[:2]
+        corners_m = np.zeros((len(nodes_m), 4, 3))
+        corners_m[..., :2] = nodes_m + marker_corners(length_m)[:, :2]
+        points_c = (corners_m - model.origin_m) @ model.camera_from_world.T
+        corners_px = project_points(model.lens_model, model.lens, points_c.reshape(-1, 3)).reshape(-1, 4, 2)
+        inside = (corners_px > 0) & (corners_px < [width, height]) & (points_c[..., 2:] > 0)
+        corners_px = corners_px[inside.all(axis=(1, 2))]
+        count = len(corners_px)
+        numbers = np.zeros(count, dtype=np.int64)
+        seen = SeenMarkers(
+            numbers, numbers, corners_px, np.tile(np.eye(8), (count, 1, 1)), np.full(count, length_m)
+        )
+        return cls(observe_level(model, seen, np.zeros(count)).by_motion[:, :2])
+
+    def mean_shift(self, motion: Array) -> float:
+        """Return the mean shift of positions by a motion (6,), in m."""
+        return float(np.linalg.norm(self.slopes @ motion, axis=1).mean()) if len(self.slopes) else 0.0
+
+    def mean_sigma(self, covariance: Array) -> float:
+        """Return the root of the mean variance of positions by the covariance of a motion, in m."""
+        variances = np.einsum("nai,ij,naj->n", self.slopes, covariance, self.slopes)
+        return float(np.sqrt(variances.mean())) if len(variances) else np.inf
+
+
+def is_change(finding: Finding, floors: Mapping[str, ViewedFloor]) -> bool:
+    """Return whether a finding is certain, and large enough for a report."""
+    if finding.excess <= _SURE:
+        return False
+    if finding.cause.kind == "camera":
+        return floors[finding.cause.name].mean_shift(finding.estimate) > LEAST_SHIFT_M
+    if finding.cause.kind == "carried":
+        return True
+    size = float(np.linalg.norm(finding.estimate[:3]))
+    least = {"robot": _LEAST_HEIGHT_M, "reference": _LEAST_REFERENCE_M, "clock": _LEAST_CLOCK_S}
+    return size > least[finding.cause.kind]
+
+
+def likely_causes(findings: Sequence[Finding]) -> list[Finding]:
+    """Return the findings that are nearly as likely as the best one."""
+    return [one for one in findings if one.evidence > findings[0].evidence - _LEAD]

@@ -1,4 +1,7 @@
-"""Errors in the user's input, in one line: what is wrong, where, and what to do."""
+"""Errors in the user's input, in one line: what is wrong, where, and what to do.
+
+Any function may raise one. Its docstring names the causes that its first line does not imply.
+"""
 
 import errno
 

@@ -48,11 +48,6 @@ def check_installed(subject: str, *modules: str) -> None:
     ----------
     subject : the beginning of the error, with its verb, such as ``view needs``.
     modules : names of modules in ``LIBRARIES``. The error names the first extra that has all of them.
-
-    Raises
-    ------
-    IpsysError
-        A library is missing.
     """
     missing = [LIBRARIES[module] for module in modules if find_spec(module) is None]
     if missing:

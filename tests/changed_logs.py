@@ -1,7 +1,5 @@
 """Copies of logs with changed messages."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Shared fixtures: the real data, and the command line in this process."""
 
-from __future__ import annotations
-
 import functools
 import gc
 import os

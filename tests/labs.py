@@ -1,7 +1,5 @@
 """Simulated labs with known ground truth, by geometry alone: camera points and tape distances."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Turn a camera exactly by the text of an advice."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Recordings with live cameras that play the frames of a log."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache

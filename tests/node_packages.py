@@ -1,7 +1,5 @@
 """Packages of npm for tests, in a folder of the cache."""
 
-from __future__ import annotations
-
 import fcntl
 import subprocess
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Simulated cameras that play available frames in place of hardware."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import Counter

@@ -5,8 +5,6 @@ port of that range may be taken before its server starts. The ports of this modu
 and no two tests of this machine get the same one.
 """
 
-from __future__ import annotations
-
 import fcntl
 import os
 import socket

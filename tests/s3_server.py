@@ -1,7 +1,5 @@
 """An S3 server on loopback, and a bucket in it, for the tests of logs in object stores."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Files that all workers of pytest-xdist share: the first worker that needs them makes them."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import shutil

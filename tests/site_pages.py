@@ -1,7 +1,5 @@
 """The documentation site: its build, and the references and anchors of its pages."""
 
-from __future__ import annotations
-
 import os
 import re
 import runpy
@@ -116,15 +114,7 @@ def _build(folder: Path) -> None:
     text = text.replace("paths: [.]", f"paths: [{ROOT}]").replace("[scripts/", f"[{ROOT}/scripts/")
     (folder / "mkdocs.yml").write_text(text, encoding="utf-8")
     # Not --quiet: it also hides the warnings from --strict.
-    command = [
-        sys.executable,
-        "-m",
-        "mkdocs",
-        "build",
-        "--strict",
-        "-f",
-        str(folder / "mkdocs.yml"),
-    ]
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "-f", str(folder / "mkdocs.yml")]
     environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
     done = subprocess.run(
         [*command, "--site-dir", str(folder / "site")],

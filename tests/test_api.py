@@ -1,7 +1,5 @@
 """The Python API: the log contents for programs, and tables that equal the decoded messages."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The drawing of the layers in the documentation shows the imports of the present source."""
 
-from __future__ import annotations
-
 import runpy
 
 from tests.conftest import ROOT

@@ -1,7 +1,5 @@
 """The benchmarks run with minimal input, and write a file with the ratios first."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

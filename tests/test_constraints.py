@@ -1,7 +1,5 @@
 """constraints.txt has one version for each dependency of the package, direct or not, within its bounds."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """The package declares each distribution that it imports, and none that it does not."""
 
-from __future__ import annotations
-
 import ast
 import re
 import sys

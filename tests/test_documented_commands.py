@@ -1,7 +1,5 @@
 """The commands on the pages exist, with their options."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The base installation: its commands work without optional libraries, and others name their extra."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,7 +1,5 @@
 """Logs of other software: images and calibrations with any names, identified by their schemas."""
 
-from __future__ import annotations
-
 import base64
 import json
 from collections.abc import Iterable
@@ -109,10 +107,7 @@ def test_detect_and_camera_frame(
     assert done.code == 0, done.err
     assert log.read_bytes().startswith(recorded)
     with Session([log]) as session:
-        assert session.images == {
-            "left_cam": "/Left-Cam/image_raw/compressed",
-            "robot_front": "/robot/front",
-        }
+        assert session.images == {"left_cam": "/Left-Cam/image_raw/compressed", "robot_front": "/robot/front"}
         # one by its topic, the other by the common frame
         assert session.calibrations == {"left_cam": "/Left-Cam/camera_info", "robot_front": "/front_info"}
         for camera, marker_id in (("left_cam", 3), ("robot_front", 4)):

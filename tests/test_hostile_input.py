@@ -1,7 +1,5 @@
 """Input with excessive or impossible values: one line, never a traceback, and little memory."""
 
-from __future__ import annotations
-
 import re
 import resource
 import struct

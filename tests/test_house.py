@@ -1,7 +1,5 @@
 """The budgets of the house: what an engineer must hold in the head."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Live recordings with late frames, and on a machine that is too slow: replay gives the same results."""
 
-from __future__ import annotations
-
 import shutil
 from itertools import zip_longest
 from math import inf

@@ -1,7 +1,5 @@
 """Imports go down the layers, never up or between neighbours; stages never import each other."""
 
-from __future__ import annotations
-
 import ast
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Live equals replay: the live results equal those from the log, byte for byte."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Several live models: each has its own chain of stages, equal to a replay with that model alone."""
 
-from __future__ import annotations
-
 from math import inf
 from pathlib import Path
 

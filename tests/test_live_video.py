@@ -1,7 +1,5 @@
 """Video above the machine's capacity: frames are skipped, and live still equals replay."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -101,10 +99,7 @@ def slow_decoding(patch: pytest.MonkeyPatch, attached: LiveCameras) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("codec", "machine"), [(H264, slow_search), (H265, slow_decoding)])
 def test_skipped_video_frames_are_equal_in_a_replay(
-    codec: tuple[str, ...],
-    machine: Machine,
-    lab_log: Path,
-    tmp_path: Path,
+    codec: tuple[str, ...], machine: Machine, lab_log: Path, tmp_path: Path
 ) -> None:
     target = tmp_path / "live.mcap"
     with streamed(lab_log, tmp_path, *codec) as address:

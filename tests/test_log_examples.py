@@ -1,7 +1,5 @@
 """The programs for logs without ipsys: a reader and a writer."""
 
-from __future__ import annotations
-
 import ast
 import json
 import runpy

@@ -1,7 +1,5 @@
 """Measuring on a finished log: measurements reach the model, and withdrawn ones do not count."""
 
-from __future__ import annotations
-
 import fcntl
 import io
 import os

@@ -1,7 +1,5 @@
 """``ipsys record --measure --points-only``: the remaining data of a session, for every end."""
 
-from __future__ import annotations
-
 import json
 import os
 import pty

@@ -1,7 +1,5 @@
 """Memory that a live run keeps, for days: nothing may grow with its frames."""
 
-from __future__ import annotations
-
 import tracemalloc
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Labs in which nodes send the markers of some cameras, and other cameras send frames."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """The publication: a wheel with all files of the package, and the citation of the version."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """The paper's figures, from the authors' data."""
 
-from __future__ import annotations
-
 import csv
 import json
 import shutil

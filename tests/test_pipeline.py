@@ -1,7 +1,5 @@
 """Replay: missing and outdated results are computed and appended, and no others."""
 
-from __future__ import annotations
-
 import json
 import random
 import shutil

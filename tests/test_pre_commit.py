@@ -1,7 +1,5 @@
 """The hooks before a commit run the same checks as scripts/test."""
 
-from __future__ import annotations
-
 import re
 
 from tests.conftest import ROOT

@@ -1,7 +1,5 @@
 """``ipsys record`` on real streams: the log contents, and the remaining data after any end."""
 
-from __future__ import annotations
-
 import os
 import re
 import resource
@@ -426,10 +424,7 @@ def test_input_is_not_overwritten(ipsys: Ipsys, lab_log: Path, tmp_path: Path) -
     rig.write_text(f'{head}[[cameras]]\nname = "red"\nsource = "file:{played}"\n')
     files = {path: path.read_bytes() for path in (played, rig, lens)}
     once = ("--rig", rig, "--calibration", lens, "--force", "--seconds", "1", "-o")
-    for path, said in (
-        (played, "is the source of camera red"),
-        (lens, "is a calibra"),
-    ):
+    for path, said in ((played, "is the source of camera red"), (lens, "is a calibra")):
         assert said in ipsys("record", *once, path).err
     model = ("--model-from", lab_log, *once)
     done = ipsys("record", "--measure", *model, lab_log)

@@ -1,7 +1,5 @@
 """Rendered sessions of the benchmark of tracks: their markers, their folder, and their continuation."""
 
-from __future__ import annotations
-
 import importlib
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Resets of detection at absolute log times: live, in a replay, and in pieces."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A killed recorder, or a full disk: the restored data and its runs."""
 
-from __future__ import annotations
-
 import shutil
 import signal
 import subprocess
@@ -113,10 +111,7 @@ LIVE = [("detect", "edges"), ("camera-frame", "edges"), ("locate", "poly"), ("fu
 
 @pytest.mark.slow
 def test_killed_live_run_is_completed_by_repair(
-    ipsys: Ipsys,
-    rig: Path,
-    calibration: Path,
-    tmp_path: Path,
+    ipsys: Ipsys, rig: Path, calibration: Path, tmp_path: Path
 ) -> None:
     log = tmp_path / "monday.mcap"
     with going_live(rig, calibration, log, 3_000_000) as program:
@@ -161,11 +156,7 @@ def test_killed_live_run_is_completed_by_repair(
 
 
 @pytest.mark.parametrize("share", first_fast(1, [0.3, 0.6, 0.95]))
-def test_skipped_frames_are_processed_by_a_replay(
-    recorded: Path,
-    tmp_path: Path,
-    share: float,
-) -> None:
+def test_skipped_frames_are_processed_by_a_replay(recorded: Path, tmp_path: Path, share: float) -> None:
     """The kill is between two writes: frames are there, but no results of the last frames."""
     chunks = sorted(_chunks(recorded), key=lambda chunk: chunk.offset)
     # The first small chunk has the settings of the recording, the second has results.
@@ -200,11 +191,7 @@ def _chunks(log: Path) -> Iterator[ChunkRef]:
 
 
 @pytest.mark.slow
-def test_run_with_other_content_is_left_unchanged(
-    recorded: Path,
-    ipsys: Ipsys,
-    tmp_path: Path,
-) -> None:
+def test_run_with_other_content_is_left_unchanged(recorded: Path, ipsys: Ipsys, tmp_path: Path) -> None:
     """No record is written for a wrong run."""
     log = tmp_path / "other.mcap"
     with Session([recorded]) as session, LogWriter.create(log) as writer:
@@ -241,10 +228,7 @@ def _moved(message: Message, end_ns: int) -> Message:
 
 @pytest.mark.slow
 def test_frames_that_were_skipped_stay_skipped(
-    lab_log: Path,
-    calibration: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    lab_log: Path, calibration: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole, cut = tmp_path / "whole.mcap", tmp_path / "cut.mcap"
     with monkeypatch.context() as patch:
@@ -267,10 +251,7 @@ def test_frames_that_were_skipped_stay_skipped(
 # A live recording until a real disk is full, then a replay of it.
 @pytest.mark.slow
 def test_a_full_disk_ends_live_with_runs_that_are_signed(
-    ipsys: Ipsys,
-    rig: Path,
-    calibration: Path,
-    tmp_path: Path,
+    ipsys: Ipsys, rig: Path, calibration: Path, tmp_path: Path
 ) -> None:
     with small_disk(tmp_path / "disk", 1000) as disk:
         log = disk / "a.mcap"

@@ -1,7 +1,5 @@
 """The sample logs of the project, and those of earlier releases."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -3,8 +3,6 @@
 The same pages are read on GitHub: the links and the structure of the pages are checked for both.
 """
 
-from __future__ import annotations
-
 import ast
 import re
 from collections import Counter

@@ -4,8 +4,6 @@ The server of the test sends a content security policy. So the browser reports e
 of a style sheet, of a script and of a worker, and does not send it.
 """
 
-from __future__ import annotations
-
 import json
 import queue
 import subprocess

@@ -1,7 +1,5 @@
 """Studies on a log: comparison of models, wrong points, and impossible questions."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

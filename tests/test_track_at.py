@@ -1,7 +1,5 @@
 """The track of a robot at any times, from a log with smoothed tracks or with tracks only."""
 
-from __future__ import annotations
-
 from datetime import UTC, datetime, timedelta, timezone
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The notebooks run completely."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Logs with H.264 frames: viewed, measured and processed like JPEG logs."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

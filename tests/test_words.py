@@ -1,7 +1,5 @@
 """Docstrings, comments and texts are plain English: no sentence begins with a relative clause."""
 
-from __future__ import annotations
-
 import ast
 import io
 import re

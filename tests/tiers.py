@@ -1,7 +1,5 @@
 """Division of a test's cases between the fast tier and the full tier."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The wait of a test for an event."""
 
-from __future__ import annotations
-
 import subprocess
 import time
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """Stages for tests, wired by hand."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 from ipsys_log.engine.stream import WiredStage, wire

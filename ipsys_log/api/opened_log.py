@@ -290,7 +290,7 @@ class Log:
     def calibrate_body(self, robot: str, rig: StrPath | None = None) -> BodyCalibration:
         """Estimate the poses and sides of a body's markers, as ``ipsys calibrate-body``; write nothing."""
         from ipsys_log.messages.rig_file import load_rig
-        from ipsys_log.tools.carried_body import calibrate_carried_body
+        from ipsys_log.tools.carried_lab import calibrate_carried_body
 
         return calibrate_carried_body(self._session, robot, load_rig(Path(rig)) if rig else None)[0]
 

@@ -62,11 +62,6 @@ class Board:
 def parse_board(text: str, square_m: float, marker_scale: float, dictionary: str, inverted: bool) -> Board:
     """Return the board for a text such as ``6x4`` or ``charuco:4x5``.
 
-    Raises
-    ------
-    IpsysError
-        The text or another value is not valid.
-
     Examples
     --------
     >>> parse_board("6x4", 0.03, 0.75, "DICT_4X4_50", False).grid

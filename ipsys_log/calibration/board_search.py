@@ -333,11 +333,6 @@ def check_sizes(sizes: Sequence[tuple[str, Size]], source: str) -> Size:
     ----------
     sizes : name and size of each image, at least one.
     source : source of the images, for messages.
-
-    Raises
-    ------
-    IpsysError
-        More than a few images have another size.
     """
     counts = Counter(size for _, size in sizes).most_common()
     if counts[0][1] >= _MOST_ARE * len(sizes):

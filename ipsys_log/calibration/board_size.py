@@ -150,11 +150,6 @@ def check_chessboard_size(sizes: Sequence[Size | None], board: Board, source: st
     sizes : size of the largest grid in each image.
     board : a chessboard.
     source : source of the images, for messages.
-
-    Raises
-    ------
-    IpsysError
-        Most images show a larger board; the text names the board that explains most corners.
     """
     larger = _largest_board([size for size in sizes if size is None or _exceeds(size, board.grid)])
     total = sum(size is not None for size in sizes)
@@ -170,13 +165,7 @@ def check_chessboard_size(sizes: Sequence[Size | None], board: Board, source: st
 
 
 def check_charuco_size(images: Sequence[Grey], board: Board, source: str) -> None:
-    """Check that the markers have the positions of a ChArUco board of the given size.
-
-    Raises
-    ------
-    IpsysError
-        The markers have other positions; the text names the board size that fits the markers.
-    """
+    """Check that the markers have the positions of a ChArUco board of the given size."""
     size = estimate_charuco_size([_as_printed(grey, board) for grey in images], board.dictionary)
     if size is None or size.image_count <= _CONTRADICTED * len(images):
         return

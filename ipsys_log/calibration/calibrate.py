@@ -177,11 +177,7 @@ def _solve(
 
 
 def _two_cameras(
-    model: LensModel,
-    start: LensFit,
-    corners: Corners,
-    used: list[BoardSighting],
-    size_px: tuple[int, int],
+    model: LensModel, start: LensFit, corners: Corners, used: list[BoardSighting], size_px: tuple[int, int]
 ) -> str:
     names = [sighting.name for sighting in used]
     split = find_two_cameras(model, start, corners, names)

@@ -64,10 +64,6 @@ def project_points(model: LensModel, parameters: Array, points_m: Array) -> Arra
 def project_with_slopes(model: LensModel, parameters: Array, points_m: Array) -> tuple[Array, Array, Array]:
     """Return the pixels of points, and their derivatives by the point and by the intrinsic parameters.
 
-    Parameters
-    ----------
-    model, parameters, points_m : as for ``project_points``.
-
     Returns
     -------
     Pixels (n, 2), their derivatives by the point (n, 2, 3), in px/m, and by the parameters (n, 2, p).
@@ -190,13 +186,7 @@ LENS_MODELS = {
 
 
 def find_lens_model(name: str) -> LensModel:
-    """Return the lens model with a name.
-
-    Raises
-    ------
-    IpsysError
-        There is no lens model with this name.
-    """
+    """Return the lens model with a name."""
     if name not in LENS_MODELS:
         raise IpsysError(f"--lens {name}: is not known; use one of {', '.join(LENS_MODELS)}")
     return LENS_MODELS[name]
@@ -222,11 +212,6 @@ def nominal_intrinsics(
     focal_px : focal length; None to compute it from the field of view.
     field_of_view_rad : horizontal field of view. Below 100 degrees, it is that of a lens that keeps straight
         lines straight, otherwise that of a fisheye lens.
-
-    Raises
-    ------
-    IpsysError
-        Neither is given, or a value is impossible.
 
     Examples
     --------

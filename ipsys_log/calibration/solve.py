@@ -35,14 +35,7 @@ _ALIKE = 0.02
 
 
 def find_start(model: LensModel, corners: Corners, size_px: tuple[int, int]) -> LensFit:
-    """Return the best of the fits from several focal lengths.
-
-    Parameters
-    ----------
-    model : the lens model.
-    corners : corners of all images.
-    size_px : width and height of the images.
-    """
+    """Return the best of the fits from several focal lengths."""
     longer = max(size_px)
     shares = _FOCAL_SHARES[model.distortion_model]
     posed = [_estimate_poses(model, corners, size_px, share * longer) for share in shares]

@@ -42,12 +42,7 @@ class _Terms(NamedTuple):
 
 
 def model_change(
-    model: LensModel,
-    fit: LensFit,
-    corners: Corners,
-    basis: Array,
-    scale_px: float | None,
-    variance: float,
+    model: LensModel, fit: LensFit, corners: Corners, basis: Array, scale_px: float | None, variance: float
 ) -> Array:
     """Return the change of the unknowns along ``basis`` with a richer model, (q,).
 

@@ -245,13 +245,7 @@ class RecentFrames:
             self._write()
 
     def put(self, message: Message) -> None:
-        """Append the next message of a recording.
-
-        Raises
-        ------
-        WriteError
-            The disk is full.
-        """
+        """Append the next message of a recording."""
         payload = message.payload
         # The event tells a replay which frames have no live results. This log holds no live results.
         if isinstance(payload, Event) and payload.kind == FRAME_SKIPPED:

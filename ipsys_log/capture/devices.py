@@ -38,13 +38,7 @@ _QUALITY = 92
 
 @contextmanager
 def open_opencv(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Frame | None]]:  # noqa: ARG001
-    """Open camera ``usb:0``, ``usb:1`` and so on; OpenCV decodes the frames, and they are encoded as JPEG.
-
-    Raises
-    ------
-    SourceError
-        The camera does not exist. The iterator raises it when the camera is disconnected.
-    """
+    """Open camera ``usb:0``, ``usb:1`` and so on; OpenCV decodes the frames, and they are encoded as JPEG."""
     number = (camera.source or "").partition(":")[2]
     if not number.isdecimal():
         raise SourceError(
@@ -120,11 +114,6 @@ def open_usb(camera: RigCamera, clock: Clock, say: Say) -> AbstractContextManage
     camera : its ``source`` is ``usb:`` and a device (``usb:/dev/video0``) or its number (``usb:0``).
     clock : converts the driver's stamps to UTC.
     say : called with each setting that the camera refused.
-
-    Raises
-    ------
-    SourceError
-        The camera does not exist, is in use, or access is denied.
     """
     # With sys.platform itself, the type checker would skip the code of the other systems.
     if _SYSTEM == "linux":
@@ -172,11 +161,6 @@ def source_opener(
     ----------
     folder : the folder of the rig file, in which the rig names certificates.
     is_stopped : ends the wait for a node.
-
-    Raises
-    ------
-    IpsysError
-        Cameras are those of nodes, and this machine cannot listen for the nodes.
     """
     of_nodes = [camera for camera in cameras if is_of_node(camera)]
     if not of_nodes:
@@ -188,13 +172,7 @@ def source_opener(
 
 
 def check_sources(cameras: Sequence[RigCamera]) -> None:
-    """Check the source of each camera without opening it: its text, its file or its device.
-
-    Raises
-    ------
-    IpsysError
-        Two cameras are the same device, a source is invalid, or its file or device does not exist.
-    """
+    """Check the source of each camera without opening it: its text, its file or its device."""
     _check_devices(cameras)
     for camera in cameras:
         source = str(camera.source)
@@ -238,13 +216,7 @@ def usb_advice(rig: Rig) -> list[str]:
 def open_source(
     camera: RigCamera, clock: Clock, say: Say
 ) -> AbstractContextManager[Iterator[Frame | SourceMessage | None]]:
-    """Open a camera of any kind; an :data:`~ipsys_log.capture.frames.Open`.
-
-    Raises
-    ------
-    IpsysError
-        The rig gives no source for the camera, or a source of an unknown kind.
-    """
+    """Open a camera of any kind; an :data:`~ipsys_log.capture.frames.Open`."""
     return _opener(camera)(camera, clock, say)
 
 

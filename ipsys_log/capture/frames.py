@@ -247,9 +247,7 @@ class Stall(NamedTuple):
 class Heartbeat:
     """A thread that notes the time periodically; a long gap means that the recorder stood still.
 
-    Parameters
-    ----------
-    clock : clock that continues while the machine sleeps.
+    The clock continues while the machine sleeps.
     """
 
     def __init__(self, clock: Clock) -> None:

@@ -111,13 +111,7 @@ def fitting_lenses(
     sizes_px: Mapping[str, tuple[int, int] | None],
     say: Callable[[str], None],
 ) -> dict[str, CameraCalibration]:
-    """Return intrinsics for the frames of cameras, scaled for frames of another size; ``say`` reports this.
-
-    Raises
-    ------
-    IpsysError
-        The frames have another aspect ratio.
-    """
+    """Return intrinsics for the frames of cameras, scaled for another size; ``say`` reports this."""
     fitting = {}
     for camera, lens in lenses.items():
         width, height = sizes_px.get(camera) or (lens.width, lens.height)

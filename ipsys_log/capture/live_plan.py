@@ -167,13 +167,7 @@ def shown_run(request: Request) -> str:
 
 
 def check_model(model: Model, cameras: Collection[str]) -> None:
-    """Check that a model has some of the cameras.
-
-    Raises
-    ------
-    IpsysError
-        The model has none of the cameras.
-    """
+    """Check that a model has some of the cameras."""
     known = sorted(camera.camera for camera in model.cameras)
     if not set(known) & set(cameras):
         raise IpsysError(
@@ -219,13 +213,7 @@ def _check(
 
 
 def check_independent_frames(cameras: Mapping[str, CameraState]) -> None:
-    """Check that each frame of the cameras can be decoded by itself.
-
-    Raises
-    ------
-    IpsysError
-        A camera sends video: its frames cannot be decoded without the frames before them.
-    """
+    """Check that each frame of the cameras can be decoded by itself."""
     for name, state in cameras.items():
         if state.format == MARKERS_FORMAT:
             raise IpsysError(

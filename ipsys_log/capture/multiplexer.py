@@ -109,9 +109,7 @@ class LiveCameras:
 
         This method takes no lock, so a signal handler may call it.
 
-        Parameters
-        ----------
-        reason : reason that the error of a later call of :meth:`save` or :meth:`add` names.
+        The error of a later call of :meth:`save` or :meth:`add` names the ``reason``.
         """
         self._reason = reason or self._reason
         self._ending = True

@@ -180,9 +180,7 @@ def _drift_ns(span_ns: int) -> int:
 class ClockHistory:
     """The clock of one session of a node, with its jumps.
 
-    Attributes
-    ----------
-    line : the newest estimate; None before the first exchange.
+    ``line`` is the newest estimate; None before the first exchange.
     """
 
     def __init__(self) -> None:

@@ -125,13 +125,7 @@ class Recording:
             self.is_renamed = True
 
     def check_file(self) -> None:
-        """Check that the log is where it was created.
-
-        Raises
-        ------
-        IpsysError
-            Another program has deleted or renamed it.
-        """
+        """Check that the log is where it was created."""
         if self.is_deleted:
             raise IpsysError(
                 f"{self.path}: {_DELETED}; the recording has stopped. If it was moved to another "

@@ -99,11 +99,6 @@ def open_simulated(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterat
         rig gives size and rate.
     clock : decides the image of each frame.
     say : called with a description of the scene, and with each setting that is refused.
-
-    Raises
-    ------
-    IpsysError
-        The lab has no such camera or setting.
     """
     simulated = parse_source(camera)
     lab = simulated.lab
@@ -126,11 +121,6 @@ def open_simulated(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterat
 
 def parse_source(camera: RigCamera) -> SimulatedCamera:
     """Parse a source; return the lab, the camera, and the board in front of the camera.
-
-    Raises
-    ------
-    IpsysError
-        The lab has no such camera, setting or board, or a value is invalid.
 
     Examples
     --------
@@ -206,13 +196,7 @@ def show_board(camera: RigCamera, board: str) -> RigCamera:
 
 
 def intrinsics_of(camera: RigCamera) -> CameraCalibration:
-    """Return the intrinsics of a simulated camera.
-
-    Raises
-    ------
-    IpsysError
-        The simulated lab has no such camera.
-    """
+    """Return the intrinsics of a simulated camera."""
     lab, number, _ = parse_source(camera)
     return replace(mount_cameras(lab)[number].lens, frame_id=camera.name)
 

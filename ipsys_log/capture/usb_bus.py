@@ -78,12 +78,7 @@ class UsbCamera(NamedTuple):
 
 
 def find_cameras(root: Path = Path("/")) -> list[UsbCamera]:
-    """Find all cameras of this machine.
-
-    Parameters
-    ----------
-    root : folder that contains ``sys`` and ``dev``.
-    """
+    """Find all cameras of this machine. ``root`` contains ``sys`` and ``dev``."""
     folder = root / "sys/class/video4linux"
     cameras = []
     for entry in sorted(folder.iterdir(), key=_number) if folder.is_dir() else ():

@@ -59,13 +59,7 @@ _QUALITY = 95
 
 @contextmanager
 def open_v4l2(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Frame | None]]:
-    """Open a camera; an :data:`~ipsys_log.capture.frames.Open`.
-
-    Raises
-    ------
-    SourceError
-        The camera cannot be opened. The iterator raises it when the camera is disconnected.
-    """
+    """Open a camera; an :data:`~ipsys_log.capture.frames.Open`."""
     path = device_path(camera.source or "")
     label = f"camera {camera.name}: {path}"
     with ExitStack() as stack:

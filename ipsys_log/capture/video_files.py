@@ -51,11 +51,6 @@ def find_video(container: InputContainer, label: str) -> VideoStream:
     ----------
     container : container that PyAV opened.
     label : first words of the error text.
-
-    Raises
-    ------
-    SourceError
-        The container has no video, or only a single image.
     """
     if not container.streams.video:
         raise SourceError(f"{label}: is not video; give the address of the camera's stream")
@@ -76,11 +71,6 @@ def pass_through(
     """Yield the packets of a stream from the first keyframe on; H.264 and H.265 as Annex B.
 
     The parameter sets come before each keyframe, so that a reader can begin at any keyframe.
-
-    Parameters
-    ----------
-    packets : packets from the container.
-    stream : stream of the packets.
     """
     from av.bitstream import BitStreamFilterContext
 
@@ -170,11 +160,6 @@ def open_video(path: Path, say: Say) -> Iterator[Iterator[TimedFrame]]:
     ----------
     path : path of the file.
     say : called if the images are encoded again.
-
-    Raises
-    ------
-    SourceError
-        The file cannot be read, or is no video.
     """
     check_installed(f"{path}: a video needs", "av")
     import av
@@ -258,11 +243,6 @@ def read_videos(
     rig, lenses : optional messages before the frames; ``lenses`` are the intrinsics by camera.
     start_ns : time of the first frames.
     say : called if the images are encoded again.
-
-    Raises
-    ------
-    SourceError
-        A file cannot be read, or is no video.
     """
     log_ns = start_ns - len(lenses) - 1
     if rig is not None:
@@ -295,11 +275,6 @@ def open_playback(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterato
         played, or the camera in the source: ``file:session.mcap?red``.
     clock : gives the stamps, as if the frames were taken now.
     say : called if the images are encoded again.
-
-    Raises
-    ------
-    SourceError
-        The file cannot be read, or a log has no such camera.
     """
     path, camera_name = check_playback_source(camera)
     if path.suffix != ".mcap":
@@ -315,13 +290,7 @@ def open_playback(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterato
 
 
 def check_playback_source(camera: RigCamera) -> tuple[Path, str]:
-    """Check that the file of a source exists; return both (see :func:`split_source`).
-
-    Raises
-    ------
-    SourceError
-        The file does not exist.
-    """
+    """Check that the file of a source exists; return both (see :func:`split_source`)."""
     path, camera_name = split_source(camera.source or "")
     if not path.is_file():
         raise SourceError(f"camera {camera.name}: {path}: does not exist")

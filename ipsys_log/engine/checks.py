@@ -167,13 +167,7 @@ def _check_request(paths: Sequence[LogLocation], request: Request, models: Seque
 
 
 def check_earlier_runs(session: Session, outcomes: Sequence[Outcome]) -> None:
-    """Check that a log has the runs of earlier stages: another program can replace it between stages.
-
-    Raises
-    ------
-    LogError
-        A run is missing: its stage has read another log.
-    """
+    """Check that a log has the runs of earlier stages: another program can replace it between stages."""
     recorded = {(record.stage, record.run) for record in session.runs()}
     for outcome in outcomes:
         if (outcome.stage, outcome.run) not in recorded:

@@ -18,6 +18,7 @@ from ipsys_log.engine.provenance import (
     find_run,
     fingerprint,
     free_name,
+    next_number,
     read_channels,
 )
 from ipsys_log.engine.request import Progress, Request
@@ -123,8 +124,7 @@ def run_stage(
         return Outcome(task.stage.name, finished_run, fresh=False)
     prepare(task, session)
     _say_renewal(session, task, record, say)
-    number = max((run.number for run in session.runs()), default=0) + 1
-    record = replace(record, fingerprint=fingerprint(), number=number)
+    record = replace(record, fingerprint=fingerprint(), number=next_number(session))
     remarks: tuple[str, ...] = ()
     run_name = name or task.run
     if counts := find_unfinished(session, target, task, run_name):
@@ -206,8 +206,7 @@ def sign(path: Path, options: Mapping[str, str], runs: Sequence[LiveRun]) -> lis
     """
     records, outcomes = [], []
     with Session([path]) as session:
-        first = max((run.number for run in session.runs()), default=0) + 1
-        for number, (stage, name, inputs, copied) in enumerate(runs, first):
+        for number, (stage, name, inputs, copied) in enumerate(runs, next_number(session)):
             if copied:
                 outcomes.append(Outcome(stage.name, name, True, 1))
                 continue

@@ -1,18 +1,17 @@
 """A mended model as a new run of a log: the model before the motion, and the markers that show the motion."""
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 
 from ipsys_log.calibration.joint.payload import PoseChange, mend_poses
 from ipsys_log.engine.graph import version_parameters, writer_of
 from ipsys_log.engine.output import append_run
-from ipsys_log.engine.provenance import complete_runs, fingerprint, free_name, newest_run, read_channels
+from ipsys_log.engine.provenance import complete_runs, new_run, newest_run, read_channels
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.location import LogLocation
-from ipsys_log.messages import ChannelRead, Message, Model, Run
+from ipsys_log.messages import Message, Model, Run
 from ipsys_log.messages.channels import MARKERS, MODEL
 from ipsys_log.models.table import reads_corners
 
@@ -82,33 +81,16 @@ def append_mended_model(
         _BASELINE: baseline.name,
         _VALID_FROM: str(valid_from_ns),
     }
+    stage = writer_of(MODEL)
     with Session([target]) as session:
-        sources = f"{log.name}:{run_of_topic(topic)}", str(newest_run(session, MARKERS))
-        record, log_time_ns = _record(session, parameters, sources, (*foreign, *reference))
+        run = str(newest_run(session, MARKERS))
+        topics = session.topics(MARKERS, run)
+        parameters |= version_parameters(stage.name, model.name)
+        sources = (f"{log.name}:{run_of_topic(topic)}", run)
+        inputs = (*foreign, *reference, *read_channels(session, topics))
+        record = Run(0, "", stage.name, parameters, input_runs=sources, inputs=inputs)
+        record, log_time_ns = new_run(session, record, f"{model.name}_mended", topics, stage.writes)
     mended = mend_poses(model, changes, record.timestamp)
     message = Message(MODEL.topic_of(record.run), log_time_ns, record.timestamp, mended)
     append_run(target, record, log_time_ns, lambda: [message], {})
     return record.run
-
-
-def _record(
-    session: Session,
-    parameters: Mapping[str, str],
-    sources: tuple[str, str],
-    foreign: tuple[ChannelRead, ...],
-) -> tuple[Run, int]:
-    """Return the record of the new run, which reads the markers of the log, and its log time."""
-    stage, model = writer_of(MODEL), parameters["model"]
-    topics = session.topics(MARKERS, sources[1])
-    log_time_ns, time_ns = session.last(topics)
-    record = Run(
-        timestamp=time_ns,
-        run="",
-        stage=stage.name,
-        parameters={**parameters, **version_parameters(stage.name, model)},
-        fingerprint=fingerprint(),
-        input_runs=sources,
-        inputs=(*foreign, *read_channels(session, topics)),
-        number=max((run.number for run in session.runs()), default=0) + 1,
-    )
-    return replace(record, run=free_name(session, record, f"{model}_mended", stage.writes)), log_time_ns

@@ -29,13 +29,7 @@ from ipsys_log.units import CM_PER_M, format_time
 
 
 def check_measurements(session: Session, request: Request, models: Sequence[str]) -> None:
-    """Check that the measurements are valid, and enough to fit the models.
-
-    Raises
-    ------
-    IpsysError
-        They are not; the text names the first fault.
-    """
+    """Check that the measurements are valid, and enough to fit the models."""
     places = measured(LogView(session, rig=request.rig))
     if not places and all(copied_run(session, model) for model in models):
         return
@@ -85,13 +79,7 @@ def check_fits(
 
 
 def check_evaluated(session: Session, request: Request, models: Sequence[str]) -> None:
-    """Check the measurements on which a model of another log is evaluated.
-
-    Raises
-    ------
-    IpsysError
-        A measurement is invalid.
-    """
+    """Check the measurements on which a model of another log is evaluated."""
     view = LogView(session, rig=request.rig)
     if any(can_evaluate(view, request.options(), model) for model in models):
         _check_places(measured(view))
@@ -105,11 +93,6 @@ def check_models(
     Returns
     -------
     One line for each difference of the rigs.
-
-    Raises
-    ------
-    IpsysError
-        A model is missing or damaged, or is for other cameras.
     """
     assert request.model_from is not None
     if not cameras:
@@ -139,10 +122,7 @@ _MOST_POINT_CHANGE_M, _MOST_SIDE_CHANGE = 0.02, 0.01
 
 
 def compare_labs(
-    model_from: LogLocation,
-    models: Iterable[Model],
-    rig: Rig | None,
-    lenses: Mapping[str, CameraCalibration],
+    model_from: LogLocation, models: Iterable[Model], rig: Rig | None, lenses: Mapping[str, CameraCalibration]
 ) -> list[str]:
     """Compare a lab with that of some models; return one line for each difference of the rigs.
 
@@ -198,13 +178,7 @@ def compare_labs(
 
 
 def check_heights(session: Session, request: Request, models: Sequence[str]) -> None:
-    """Check that the rig has a height for each marker, if a model needs the heights of markers.
-
-    Raises
-    ------
-    IpsysError
-        The rig has no height for a marker.
-    """
+    """Check that the rig has a height for each marker, if a model needs the heights of markers."""
     rigs = [request.rig] if request.rig is not None else session.payloads(session.topics(RIG))
     for name in models:
         for rig in rigs:
@@ -219,13 +193,7 @@ def check_heights(session: Session, request: Request, models: Sequence[str]) -> 
 
 
 def check_evaluation(session: Session, request: Request, models: Sequence[str]) -> None:
-    """Check that the log has points to evaluate a model on.
-
-    Raises
-    ------
-    IpsysError
-        It has neither held-out points nor enough points for cross-validation.
-    """
+    """Check that the log has points to evaluate a model on."""
     view = LogView(session, rig=request.rig)
     if not any(can_evaluate(view, request.options(), model) for model in models):
         raise IpsysError(

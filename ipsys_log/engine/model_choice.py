@@ -43,11 +43,6 @@ def choose_models(request: Request, paths: Sequence[LogLocation], until: Stage) 
     - the model and the settings of the newest run, for a stage that applies a model;
     - the models that were copied into the logs, if these have no measurements to fit to;
     - ``joint`` if the logs have markers, or images, and their heights; ``best`` if not.
-
-    Raises
-    ------
-    IpsysError
-        A name is not in the table, or a log has no fitted model to apply.
     """
     if request.models or request.model_from is not None:
         return Choice(request, *applied_models(request))
@@ -66,13 +61,7 @@ def choose_models(request: Request, paths: Sequence[LogLocation], until: Stage) 
 
 
 def applied_models(request: Request) -> tuple[tuple[str, ...], str]:
-    """Return the models of a request, or the newest one of its other log, and the reason.
-
-    Raises
-    ------
-    IpsysError
-        A name is not in the table, or the other log has no fitted model.
-    """
+    """Return the models of a request, or the newest one of its other log, and the reason."""
     for name in request.models:
         check_name(name)
     if request.models:
@@ -96,11 +85,6 @@ def newest_model(session: Session) -> str:
 
     Several models that are only fitted and evaluated were not selected: ``evaluate`` fits all models. Then it
     is the most accurate one of them.
-
-    Raises
-    ------
-    IpsysError
-        There is no fitted model.
     """
     records = complete_runs(session)
     if chain := _newest_chain(records):

@@ -57,13 +57,7 @@ def write_log(path: Path, messages: Iterable[Message]) -> dict[str, int]:
 
 
 def check_copy(paths: Sequence[LogLocation], output: Path, overwrite: bool) -> None:
-    """Refuse an output that is one of the logs, or that exists, except with ``overwrite``.
-
-    Raises
-    ------
-    IpsysError
-        The output is refused.
-    """
+    """Refuse an output that is one of the logs, or that exists, except with ``overwrite``."""
     if not output.exists():
         return
     if is_one_of(output, paths):
@@ -152,13 +146,7 @@ def derived_log_of(source: LogLocation, folder: Path | None = None) -> Path | No
 
 
 def logs_with_results(source: LogLocation, folder: Path | None = None) -> list[LogLocation]:
-    """Return a log, and its derived log in a folder if there is one, as :func:`choose_target` names it.
-
-    Raises
-    ------
-    IpsysError
-        The derived log has results of another log.
-    """
+    """Return a log, and its derived log in a folder if there is one, as :func:`choose_target` names it."""
     return choose_target([source], None, folder)[0]
 
 
@@ -178,11 +166,6 @@ def check_source(paths: Sequence[LogLocation], derived: Path) -> None:
     """Check that a derived log has results of these logs: its runs name their inputs by content.
 
     The largest input decides, such as the markers: two logs of a lab can have equal rigs and intrinsics.
-
-    Raises
-    ------
-    IpsysError
-        The derived log has results of another log.
     """
     with Session([derived]) as results, Session(paths) as session:
         inputs = [read for run in results.runs() for read in run.inputs]

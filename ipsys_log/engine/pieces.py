@@ -86,13 +86,7 @@ class PieceRun:
 
     @contextmanager
     def open(self) -> Iterator[Callable[[Piece], PieceResult]]:
-        """Open the logs; yield the function that computes a piece.
-
-        Raises
-        ------
-        IpsysError
-            A log has changed.
-        """
+        """Open the logs; yield the function that computes a piece."""
         with Session(self.paths) as session:
             check_versions(session, self)
             yield partial(compute_piece, session, self)
@@ -222,13 +216,7 @@ def split_frames(frames: PieceFrames, resets: Resets) -> list[Piece]:
 
 
 def check_versions(session: Session, run: PieceRun) -> None:
-    """Check that open logs are still those of a run.
-
-    Raises
-    ------
-    IpsysError
-        Another program has changed or replaced a log.
-    """
+    """Check that open logs are still those of a run."""
     for reader, version in zip(session.readers, run.versions, strict=True):
         if reader.view.identity()[1] != version:
             raise IpsysError(f"{reader.path} changed while it was read: run the command again")

@@ -158,9 +158,7 @@ def find_run(session: Session, wanted: Run, purpose: Channel, name: str | None =
 
     A copied run is found if its inputs were only copied, in part or with other times, and not changed.
 
-    Parameters
-    ----------
-    purpose : the channel of the result, of which a copy must have a part.
+    ``purpose`` is the channel of the result, of which a copy must have a part.
     """
     essence = _identity(wanted)
     for run in reversed(complete_runs(session)):
@@ -225,6 +223,33 @@ def free_name(session: Session, record: Run, base: str, writes: Sequence[Channel
     return f"{base}_{number}"
 
 
+def next_number(session: Session) -> int:
+    """Return the number of the next run of a log."""
+    return max((run.number for run in session.runs()), default=0) + 1
+
+
+def new_run(
+    session: Session, record: Run, base: str, topics: Sequence[str], writes: Sequence[Channel] = ()
+) -> tuple[Run, int]:
+    """Return the record of a run with its name, its number and the time of its last input; and its log time.
+
+    Parameters
+    ----------
+    record : stage, parameters and inputs.
+    base, writes : as for :func:`free_name`.
+    topics : the inputs in this log.
+    """
+    log_time_ns, time_ns = session.last(topics)
+    record = replace(
+        record,
+        timestamp=time_ns,
+        run=free_name(session, record, base, writes),
+        fingerprint=fingerprint(),
+        number=next_number(session),
+    )
+    return record, log_time_ns
+
+
 def _has_stage(session: Session, stage: str, name: str, writes: Sequence[Channel]) -> bool:
     """Return whether a run has a stage, by its record or by the first channel that the stage writes."""
     recorded = any((run.run, run.stage) == (name, stage) for run in session.runs())
@@ -232,13 +257,7 @@ def _has_stage(session: Session, stage: str, name: str, writes: Sequence[Channel
 
 
 def check_run_name(session: Session, stage: str, name: str, writes: Sequence[Channel]) -> str:
-    """Return the name that a user gave a run, if the run does not have that stage yet.
-
-    Raises
-    ------
-    IpsysError
-        The run already has that stage.
-    """
+    """Return the name that a user gave a run, if the run does not have that stage yet."""
     if _has_stage(session, stage, name, writes):
         raise IpsysError(f"run {name} already has the stage {stage} with other input; use another --run name")
     return name

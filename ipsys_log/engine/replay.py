@@ -76,13 +76,7 @@ class Replay:
         return self.choice.models
 
     def compute(self) -> None:
-        """Run the stages that all models share, and then those of each model.
-
-        Raises
-        ------
-        IpsysError
-            The input has a fault that the user must correct.
-        """
+        """Run the stages that all models share, and then those of each model."""
         with Session(self.logs) as session:
             shared = imported_inputs(session)
         of_model = [stage for stage in self.stages if is_of_model(stage)]

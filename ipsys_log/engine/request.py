@@ -91,13 +91,7 @@ def has_corners(session: Session) -> bool:
 
 
 def fitted_in(other: Session, name: str | None) -> tuple[Model, str]:
-    """Return the newest model in another log, and its topic; of the given name, or of a run of this name.
-
-    Raises
-    ------
-    IpsysError
-        There is no such model.
-    """
+    """Return the newest model in another log, and its topic; of the given name, or of a run of this name."""
     models: list[Model] = []
     for topic in reversed(topics := _model_topics(other)):
         models.append(other.payloads([topic])[-1])
@@ -140,11 +134,6 @@ def rig_with_offsets(session: Session) -> Rig:
     """Return the newest rig of a log, with the edge offsets of its cameras.
 
     If the rig has no edge offset for a camera, the offset is the median over the newest detection.
-
-    Raises
-    ------
-    IpsysError
-        The log holds no rig.
     """
     rigs: list[Rig] = session.payloads(session.topics(RIG))
     if not rigs:

@@ -3,12 +3,7 @@
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
 
-from ipsys_log.engine.graph import (
-    VERSIONS,
-    method_of,
-    versioned_names,
-    writes,
-)
+from ipsys_log.engine.graph import VERSIONS, method_of, versioned_names, writes
 from ipsys_log.engine.provenance import (
     complete_runs,
     copied_from,

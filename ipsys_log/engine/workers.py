@@ -34,13 +34,7 @@ def available_cores() -> int:
 
 
 def check_jobs(jobs: int) -> None:
-    """Check a number of processes.
-
-    Raises
-    ------
-    IpsysError
-        The number is too large for this machine.
-    """
+    """Check a number of processes."""
     cores = available_cores()
     most = max(_MOST_JOBS_OF_CORE * cores, _MOST_JOBS_OF_SMALL_MACHINE)
     if jobs > most:
@@ -105,9 +99,7 @@ class _Worker(PipedProcess):
 class LocalWorkers:
     """Worker processes, started for each run. A context manager that ends them.
 
-    Parameters
-    ----------
-    jobs : number of processes; with 1, runs are computed in this process.
+    With one of them (``jobs``), runs are computed in this process.
     """
 
     first_only = False
@@ -128,13 +120,7 @@ class LocalWorkers:
         return self.jobs > 1
 
     def prepare(self, plan: Plan) -> None:
-        """Start the workers of a plan; they import the package while this process prepares the run.
-
-        Raises
-        ------
-        IpsysError
-            A worker cannot be started.
-        """
+        """Start the workers of a plan; they import the package while this process prepares the run."""
         count = min(self.jobs, len(plan.pieces))
         while len(self._workers) < count:
             try:
@@ -194,13 +180,7 @@ class LocalWorkers:
         return [worker for worker in self._workers if worker.receiver in ready]
 
     def _replace(self, worker: _Worker, plan: Plan, waiting: deque[int], ended: Counter[int]) -> None:
-        """Start another worker instead of one that has ended, and let its pieces wait again.
-
-        Raises
-        ------
-        IpsysError
-            Its piece has ended other workers before, or no worker can be started.
-        """
+        """Start another worker instead of one that has ended, and let its pieces wait again."""
         text = worker.describe_end()
         self._workers.remove(worker)
         worker.close()

@@ -88,13 +88,7 @@ FORMATS: dict[str, tuple[Callable[[CameraCalibration, Mapping[str, float], str],
 
 
 def check_format(name: str, lens_model: str) -> None:
-    """Check that a format exists and supports the lens model (``fisheye``, ``pinhole4`` ...).
-
-    Raises
-    ------
-    IpsysError
-        The format does not exist, or does not support the lens model.
-    """
+    """Check that a format exists and supports the lens model (``fisheye``, ``pinhole4`` ...)."""
     if name not in FORMATS:
         raise IpsysError(f"--format {name}: is not known; use one of {', '.join(FORMATS)}")
     if name == "kalibr" and lens_model not in ("fisheye", "pinhole4"):
@@ -124,14 +118,8 @@ def read_intrinsics(
     From a log, the newest calibration of the camera is read. If the log holds the calibration of a single
     camera, this camera may have another name.
 
-    Parameters
-    ----------
-    report : called with the camera and a remark if the lens model is assumed, because the file states none.
-
-    Raises
-    ------
-    IpsysError
-        The file does not exist, cannot be read, or holds no valid calibration of this camera.
+    ``report`` is called with the camera and a remark if the lens model is assumed, because the file states
+    none.
     """
     if path.suffix != ".mcap":
         if not isinstance(path, Path):

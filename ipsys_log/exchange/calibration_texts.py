@@ -47,13 +47,7 @@ class ParsedText(NamedTuple):
 
 
 def read_text(path: Path) -> str:
-    """Return the text of a file in UTF-8, UTF-16 or, if it is none of them, Windows-1252.
-
-    Raises
-    ------
-    IpsysError
-        The file does not exist, cannot be read, or has no text.
-    """
+    """Return the text of a file in UTF-8, UTF-16 or, if it is none of them, Windows-1252."""
     if not path.is_file():
         raise IpsysError(f"{path}: does not exist; 'ipsys calibrate' writes a calibration file")
     try:

@@ -52,10 +52,7 @@ class CocoCounts(NamedTuple):
 
 
 def write_coco(
-    session: Session,
-    run: str,
-    folder: Path,
-    progress: Progress = lambda step, done, total: None,
+    session: Session, run: str, folder: Path, progress: Progress = lambda step, done, total: None
 ) -> CocoCounts:
     """Write the pictures that a run of detect has searched, and their markers; memory is constant.
 
@@ -63,11 +60,6 @@ def write_coco(
     videos become PNG, in grey. ``annotations.json`` has an image for each picture, also without markers, and
     an annotation for each marker: ``keypoints`` are the corners with all stored digits, clockwise from the
     top left of the marker; ``marker_id``; ``bbox``, ``segmentation`` and ``area`` in px.
-
-    Parameters
-    ----------
-    run : the run of the markers.
-    folder : a new folder.
 
     Raises
     ------

@@ -87,13 +87,7 @@ TABLES = (*_ITEMS, "measurements", "events", "latency", "commands", "pairs")
 
 
 def import_pandas() -> Any:
-    """Return the module pandas.
-
-    Raises
-    ------
-    IpsysError
-        It is not installed.
-    """
+    """Return the module pandas."""
     check_installed("tables need", "pandas")
     import pandas as pd
 
@@ -110,11 +104,6 @@ def read_table(
     name : one of :data:`TABLES`.
     runs : the runs to read; with several runs, a column names the run. None for a recorded channel.
     start_ns, end_ns : log times; the end is not included.
-
-    Raises
-    ------
-    IpsysError
-        pandas is not installed, or there is no such table.
     """
     pandas = _import_for(name)
     tables = [_read_run(pandas, session, name, run, start_ns, end_ns) for run in runs]
@@ -135,11 +124,6 @@ def read_table_parts(
     name : one of :data:`TABLES`.
     run : the run to read; None for a recorded channel.
     with_turns : tracks have the columns of bodies that are not level, also if the rig has none.
-
-    Raises
-    ------
-    IpsysError
-        pandas is not installed, or there is no such table.
     """
     pandas = _import_for(name)
     if name in _ITEMS:

@@ -45,11 +45,6 @@ def export_file(
     name : one of :data:`~ipsys_log.exchange.data_frames.TABLES`.
     runs : the runs to read, or one None for a recorded channel.
     robot : only this robot.
-
-    Raises
-    ------
-    IpsysError
-        The table does not fit the format, or a library is missing.
     """
     check_installed("export needs", "pandas")
     suffix = path.suffix.lower()
@@ -168,11 +163,6 @@ def export_pairs(pairs: PosePairs, path: Path) -> tuple[int, Path]:
     ----------
     path : of the new file; its suffix is one of ``TRAJECTORIES``. The name of the second one, which is
         returned, ends in ``_truth``.
-
-    Raises
-    ------
-    IpsysError
-        No pose has a rotation in both.
     """
     # Late: most commands rotate nothing, and scipy takes long to load.
     from scipy.spatial.transform import Rotation
@@ -212,11 +202,6 @@ def export_trajectory(session: Session, name: str, run: str | None, path: Path, 
     name : a table of tracks.
     path : of the new file; its suffix is one of ``TRAJECTORIES``.
     robot : None if the table has one robot only.
-
-    Raises
-    ------
-    IpsysError
-        There is no such robot, there are several and none is given, or no row has a heading.
 
     References
     ----------

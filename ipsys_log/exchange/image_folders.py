@@ -66,11 +66,6 @@ def find_times(images: Mapping[str, list[Path]], times: str) -> dict[Path, int]:
     ----------
     images : image files by camera, from :func:`~ipsys_log.exchange.image_folders.find_images`.
     times : ``names``, or a CSV file with the columns ``file`` (such as ``red/0001.jpg``) and ``time``.
-
-    Raises
-    ------
-    IpsysError
-        An image has no time, a time cannot be read, or two images of one camera have the same time.
     """
     if times == NAMES:
         times_ns = {path: _time(path.stem, str(path)) for paths in images.values() for path in paths}
@@ -88,13 +83,7 @@ def find_times(images: Mapping[str, list[Path]], times: str) -> dict[Path, int]:
 
 
 def parse_start(text: str) -> int:
-    """Parse the time of the option ``--start``.
-
-    Raises
-    ------
-    IpsysError
-        The text is no time.
-    """
+    """Parse the time of the option ``--start``."""
     return _time(text, "--start")
 
 
@@ -142,11 +131,6 @@ def find_images(folder: Path) -> dict[str, list[Path]]:
     """Find the images of a folder with one sub-folder per camera; return them by camera.
 
     The images are in the order of their names. Numbers in the names count by their value: img2 before img10.
-
-    Raises
-    ------
-    IpsysError
-        The folder has no images, or an image has a format that cannot be read.
     """
     if not folder.is_dir():
         raise IpsysError(f"{folder}: does not exist; give a folder of pictures")

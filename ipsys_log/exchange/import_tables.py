@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ipsys_log.engine.output import append_run, open_target
-from ipsys_log.engine.provenance import check_run_name, fingerprint, free_name
+from ipsys_log.engine.provenance import check_run_name, fingerprint, free_name, next_number
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.calibration_files import announce_assumed
 from ipsys_log.exchange.image_folders import parse_time
@@ -249,8 +249,7 @@ def import_detections(
         if session is None:
             messages = [*announce_assumed(_settings(options.rig, lenses, frames), assumed), *messages]
         last_ns = frames[-1].log_time_ns
-        earlier = session.runs() if session is not None else []
-        number = max((other.number for other in earlier), default=0) + 1
+        number = 1 if session is None else next_number(session)
         parameters = {"format": "ros" if is_bag else "csv", "file": file.name}
         record = Run(last_ns, run, IMPORTED, parameters, fingerprint(), number=number)
         _, target = stack.enter_context(open_target([into] if into is not None else [], output))

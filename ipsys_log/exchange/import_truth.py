@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ipsys_log.engine.output import append_run, open_target
-from ipsys_log.engine.provenance import fingerprint, free_name, newest_run, read_channels
+from ipsys_log.engine.provenance import fingerprint, free_name, newest_run, next_number, read_channels
 from ipsys_log.engine.request import Progress
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.trajectory_columns import GivenUnits
@@ -347,5 +347,5 @@ def _record(
         run=free_name(session, record, _RUN, (TRUTH,)),
         input_runs=() if run is None else (run,),
         inputs=() if run is None else read_channels(session, session.topics(TRACKS, run)),
-        number=max((other.number for other in session.runs()), default=0) + 1,
+        number=next_number(session),
     )

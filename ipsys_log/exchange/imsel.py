@@ -141,11 +141,6 @@ def read_imsel(folder: Path) -> Iterator[Message]:
     two cameras each. Their measurements have different labels, so they stay separate; ``calibration_point``
     is the same. The 40 training points have the label
     ``train``, and the published subsets the labels ``train_10`` to ``train_40``. The others have ``test``.
-
-    Raises
-    ------
-    IpsysError
-        A file is missing or has wrong contents.
     """
     mats = {name: read_mat(_find(folder, f"{name}.mat")) for name in ("testing", *map(_training, SUBSETS))}
     lenses = {camera: _find(folder, f"{stem}_calib.yaml") for camera, stem in CAMERAS.items()}

@@ -31,11 +31,6 @@ def read_lab(
     ----------
     only : names of some cameras; none: all cameras with a source.
     given : intrinsics that replace those of the rig, by camera.
-
-    Raises
-    ------
-    IpsysError
-        The rig, the source of a camera, or a file of intrinsics has a fault.
     """
     rig, cameras = load_cameras(path, only)
     assumed: dict[str, str] = {}
@@ -45,13 +40,7 @@ def read_lab(
 
 
 def load_cameras(path: Path, only: Collection[str] = ()) -> tuple[Rig, list[RigCamera]]:
-    """Return the rig of a file, and its cameras that have a source, or only the cameras in ``only``.
-
-    Raises
-    ------
-    IpsysError
-        The rig has no such camera, or no camera with a source.
-    """
+    """Return the rig of a file, and its cameras that have a source, or only the cameras in ``only``."""
     rig = load_rig(path)
     marker_detector(rig.dictionary)  # a wrong name is an error now, not at the first frame
     known = {camera.name: camera for camera in rig.cameras}
@@ -88,11 +77,6 @@ def load_lenses(
     path : path of the rig file; names of files are relative to its folder.
     read : read the files; without it, only the given intrinsics are returned.
     report : called with a camera and a remark if its file does not state the lens model.
-
-    Raises
-    ------
-    IpsysError
-        A file cannot be read, or intrinsics are given for another camera.
     """
     names = [camera.name for camera in cameras]
     lenses = dict(given)
@@ -124,13 +108,7 @@ def simulated_lab_texts(path: Path) -> dict[Path, str]:
 
 
 def write_new(texts: Mapping[Path, str]) -> None:
-    """Write files that do not exist yet: all of them, or none.
-
-    Raises
-    ------
-    IpsysError
-        A file exists.
-    """
+    """Write files that do not exist yet: all of them, or none."""
     made: list[Path] = []
     try:
         for path, text in texts.items():

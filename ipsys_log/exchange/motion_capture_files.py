@@ -46,11 +46,6 @@ def read_motion_capture(path: Path, wanted: Sequence[str], units: GivenUnits) ->
     Parameters
     ----------
     wanted : names of single markers to read beside the bodies.
-
-    Raises
-    ------
-    IpsysError
-        The head lines are incomplete, or name no body.
     """
     with path.open("rb") as file:
         head = file.read(_HEAD_BYTES).decode(encoding_of(path), errors="replace")
@@ -204,13 +199,7 @@ def _read_trc(path: Path, rows: Iterator[Row], units: GivenUnits) -> Reading:
 
 
 def read_c3d(path: Path, units: GivenUnits) -> Reading:
-    """Read the markers of a C3D file.
-
-    Raises
-    ------
-    IpsysError
-        The library is not installed, or the file is damaged.
-    """
+    """Read the markers of a C3D file."""
     check_installed("C3D files need", "c3d")
     import c3d
 

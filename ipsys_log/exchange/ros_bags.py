@@ -284,13 +284,7 @@ _MCAP = ".mcap"
 
 
 def bound_reader(path: Path, reader: Reader1 | Reader2) -> bool:
-    """Bound the decompression of an open bag; return whether its messages are to be unpacked one by one.
-
-    Raises
-    ------
-    IpsysError
-        A chunk holds more than its limit.
-    """
+    """Bound the decompression of an open bag; return whether its messages are to be unpacked one by one."""
     if isinstance(reader, Reader1):
         limits = ReadLimits(path.stat().st_size)
         for position, chunk in reader.chunks.items():
@@ -332,13 +326,7 @@ def check_files(path: Path) -> None:
 
 
 def unpack_message(path: Path, data: bytes) -> bytes:
-    """Return a message of a bag whose messages are compressed one by one.
-
-    Raises
-    ------
-    IpsysError
-        The message holds more than its limit.
-    """
+    """Return a message of a bag whose messages are compressed one by one."""
     return _unpack(path, ReadLimits(path.stat().st_size + len(data)), 0, _zstd_pieces, data)
 
 
@@ -353,11 +341,7 @@ def _count(file: Path) -> None:
 
 
 def _unpack(
-    path: Path,
-    limits: ReadLimits,
-    position: int,
-    pieces_of: Callable[[bytes], Iterator[bytes]],
-    data: bytes,
+    path: Path, limits: ReadLimits, position: int, pieces_of: Callable[[bytes], Iterator[bytes]], data: bytes
 ) -> bytes:
     pieces: list[bytes] = []
     size = 0
@@ -369,20 +353,15 @@ def _unpack(
     return b"".join(pieces)
 
 
-def _bz2_pieces(data: bytes) -> Iterator[bytes]:
-    stream = bz2.BZ2Decompressor()
+def _stream_pieces(
+    decompressor: Callable[[], bz2.BZ2Decompressor | lz4.frame.LZ4FrameDecompressor], data: bytes
+) -> Iterator[bytes]:
+    stream = decompressor()
     yield stream.decompress(data, _PIECE)
     while not stream.eof and not stream.needs_input:
         yield stream.decompress(b"", _PIECE)
-    _check_end(stream.eof)
-
-
-def _lz4_pieces(data: bytes) -> Iterator[bytes]:
-    stream = lz4.frame.LZ4FrameDecompressor()
-    yield stream.decompress(data, _PIECE)
-    while not stream.eof and not stream.needs_input:
-        yield stream.decompress(b"", _PIECE)
-    _check_end(stream.eof)
+    if not stream.eof:
+        raise EOFError("a compressed chunk is cut off")
 
 
 def _zstd_pieces(data: bytes) -> Iterator[bytes]:
@@ -391,10 +370,8 @@ def _zstd_pieces(data: bytes) -> Iterator[bytes]:
             yield piece
 
 
-def _check_end(is_complete: bool) -> None:
-    if not is_complete:
-        raise EOFError("a compressed chunk is cut off")
-
-
 # The functions by which the library unpacks chunks of ROS 1, each with one that can stop.
-_STREAMS = {bz2.decompress: _bz2_pieces, lz4.frame.decompress: _lz4_pieces}
+_STREAMS = {
+    bz2.decompress: partial(_stream_pieces, bz2.BZ2Decompressor),
+    lz4.frame.decompress: partial(_stream_pieces, lz4.frame.LZ4FrameDecompressor),
+}

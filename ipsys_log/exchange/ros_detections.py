@@ -16,14 +16,7 @@ from rosbags.typesys import Stores, get_types_from_msg
 
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.import_tables import DetectedFrame
-from ipsys_log.exchange.ros_bags import (
-    BagReader,
-    faults,
-    message_types,
-    open_bag,
-    raw_messages,
-    ros1_types,
-)
+from ipsys_log.exchange.ros_bags import BagReader, faults, message_types, open_bag, raw_messages, ros1_types
 from ipsys_log.log.contents import clean_name
 from ipsys_log.messages import Array, Marker, Rig
 from ipsys_log.plain_text import join_names

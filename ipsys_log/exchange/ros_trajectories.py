@@ -13,14 +13,7 @@ from rosbags.typesys import Stores
 
 from ipsys_log.engine.request import Progress
 from ipsys_log.errors import IpsysError
-from ipsys_log.exchange.ros_bags import (
-    BagReader,
-    faults,
-    message_types,
-    open_bag,
-    raw_messages,
-    ros1_types,
-)
+from ipsys_log.exchange.ros_bags import BagReader, faults, message_types, open_bag, raw_messages, ros1_types
 from ipsys_log.exchange.trajectory_tables import Reading, make_trajectory
 from ipsys_log.plain_text import join_names
 from ipsys_log.statistics.trajectories import Trajectory

@@ -18,13 +18,7 @@ _LONGEST_TEXT = 40
 
 @contextmanager
 def open_as_text(path: Path) -> Iterator[None]:
-    """Give the errors of the operating system and of the decoders one line.
-
-    Raises
-    ------
-    IpsysError
-        The file cannot be read, or is no text file.
-    """
+    """Give the errors of the operating system and of the decoders one line."""
     try:
         yield
     except OSError as error:
@@ -34,13 +28,7 @@ def open_as_text(path: Path) -> Iterator[None]:
 
 
 def read_cells(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Yield line number and cells of the header, and of each row that is not blank.
-
-    Raises
-    ------
-    IpsysError
-        The file is empty, or a row has another number of cells than the header.
-    """
+    """Yield line number and cells of the header, and of each row that is not blank."""
     with path.open(newline="", encoding="utf-8-sig") as file:
         table = csv.reader(file)
         header = next(table, None)
@@ -98,13 +86,7 @@ class NamedRow(NamedTuple):
 
 
 def read_named_rows(path: Path, needed: Collection[str]) -> Iterator[NamedRow]:
-    """Yield the rows of a CSV file; more columns than the needed ones are allowed.
-
-    Raises
-    ------
-    IpsysError
-        The file cannot be read, has no such column, or a column twice.
-    """
+    """Yield the rows of a CSV file; more columns than the needed ones are allowed."""
     with open_as_text(path):
         cells = read_cells(path)
         header = [name.strip().lower() for name in next(cells)[1]]
@@ -118,13 +100,7 @@ def read_named_rows(path: Path, needed: Collection[str]) -> Iterator[NamedRow]:
 
 
 def parse_number(text: str, where: str, advice: str) -> float:
-    """Return a finite number.
-
-    Raises
-    ------
-    IpsysError
-        The text is no number, or is infinite.
-    """
+    """Return a finite number."""
     try:
         value = float(text)
     except ValueError:
@@ -151,11 +127,6 @@ def write_rows(path: Path, rows: Iterable[Mapping[str, Any]], columns: Columns, 
     columns : the type of each column, such as ``int64``, ``list<string>`` or ``time``; the columns of the
         items for a list of rows.
     mark : a text that :func:`read_rows` returns.
-
-    Raises
-    ------
-    IpsysError
-        PyArrow is not installed.
     """
     check_installed("Parquet files need", "pyarrow")
     import pyarrow as pa

@@ -101,10 +101,6 @@ def attribute_columns(
 ) -> tuple[Layout, list[str]]:
     """Return the layout of a table with a header, and what its columns were taken for, as texts.
 
-    Parameters
-    ----------
-    sample : the cells of the first rows.
-
     Raises
     ------
     IpsysError

@@ -301,11 +301,6 @@ def assign_robots(
     robots : texts of ``--robot``: ``NAME=BODY`` selects a body of a file. A plain ``NAME`` is for the next
         body whose name is not one of a robot. The other bodies of a file are left out if one is selected.
     known : the robots of the rig; empty if it names none.
-
-    Raises
-    ------
-    IpsysError
-        A body or a robot is not known, a body has no robot, or a robot has two bodies.
     """
     chosen = dict(text.partition("=")[::2] for text in robots if "=" in text)
     names = [text for text in robots if "=" not in text]

@@ -95,13 +95,7 @@ class _Poses:
 
 
 def read_poses(path: Path, rows: Iterator[Row], layout: Layout) -> list[Trajectory]:
-    """Return the poses of each body of a table, without the bodies that have none.
-
-    Raises
-    ------
-    IpsysError
-        A cell is no number, a row names no body, or a quaternion is none.
-    """
+    """Return the poses of each body of a table, without the bodies that have none."""
     by_name = {body.name: _Poses(body) for body in layout.bodies if layout.label is None}
     places = sorted({place for body in layout.bodies for place in (*body.point, *body.turn)})
     most = max((*places, *layout.time, layout.label or 0))
@@ -152,13 +146,7 @@ def make_trajectory(
     quaternions: Array | None,
     covariances: Array | None = None,
 ) -> Trajectory:
-    """Return the poses in the order of their times, without rows that are none; see `Trajectory.left_out`.
-
-    Raises
-    ------
-    IpsysError
-        Most of the quaternions do not have the length 1.
-    """
+    """Return the poses in the order of their times, without rows that are none; see `Trajectory.left_out`."""
     turns = np.full((len(times_ns), 4), np.nan) if quaternions is None else quaternions.copy()
     lengths = np.linalg.norm(turns, axis=1)
     turns[~(np.abs(lengths - 1) <= _UNIT_TOLERANCE)] = np.nan
@@ -256,11 +244,6 @@ def encoding_of(path: Path) -> str:
 def parse_offset(text: str) -> int:
     """Return the time offset of the option ``--time-offset``, from s to ns.
 
-    Raises
-    ------
-    IpsysError
-        The text is no number.
-
     Examples
     --------
     >>> parse_offset("-1.25")
@@ -271,11 +254,6 @@ def parse_offset(text: str) -> int:
 
 def parse_pivot(text: str) -> tuple[float, float, float]:
     """Return the pivot of the option ``--pivot``, (3,) in m.
-
-    Raises
-    ------
-    IpsysError
-        The text is not three numbers.
 
     Examples
     --------
@@ -292,13 +270,7 @@ def parse_pivot(text: str) -> tuple[float, float, float]:
 
 
 def parse_time_ns(text: str, tick_ns: int, where: str) -> int:
-    """Return a time in ns with all its digits, which a float cannot hold.
-
-    Raises
-    ------
-    IpsysError
-        The text is no number, or too large.
-    """
+    """Return a time in ns with all its digits, which a float cannot hold."""
     try:
         value = Decimal(with_decimal_point(text)) * tick_ns
     except ArithmeticError:

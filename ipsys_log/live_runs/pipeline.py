@@ -92,11 +92,6 @@ def replay(
     Returns
     -------
     One outcome for each stage, in order, with the run of its result; ``fresh`` if the run is new.
-
-    Raises
-    ------
-    IpsysError
-        The input has a fault that the user must correct.
     """
     check_jobs(jobs)
     stages = stages_until(until)

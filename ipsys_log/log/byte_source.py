@@ -127,13 +127,7 @@ class PartCounter:
     left: int
 
     def take(self, number: int) -> None:
-        """Count `number` parts.
-
-        Raises
-        ------
-        BoundError
-            `number` is larger than the number of parts left.
-        """
+        """Count `number` parts."""
         self.left -= number
         if self.left < 0:
             raise BoundError("the messages have more parts than a log of this size may hold")

@@ -39,13 +39,7 @@ class _Total:
 def read_sizes(
     view: LogBytes, contents: Contents, progress: Callable[[int], None] = lambda done: None
 ) -> list[ChannelSize]:
-    """Return the sizes of the channels, the largest in the file first; every chunk is read once.
-
-    Raises
-    ------
-    LogError
-        A chunk is damaged, or the log exceeds the limits of its file size.
-    """
+    """Return the sizes of the channels, the largest in the file first; every chunk is read once."""
     totals: defaultdict[str, _Total] = defaultdict(_Total)
     for channel in contents.channels.values():
         totals[channel.topic] = _Total()

@@ -26,6 +26,7 @@ from ipsys_log import messages
 from ipsys_log.errors import LogError
 from ipsys_log.log.byte_source import PartCounter
 from ipsys_log.log.ros2 import ROS2_PAYLOADS, read_ros2
+from ipsys_log.messages.channels import CHANNELS
 
 NS = 1_000_000_000
 _LATEST_NS = 1 << 63
@@ -149,50 +150,22 @@ def _repeated(name: str, item: Any) -> tuple[Fill, Read]:
     return fill, read
 
 
-# The payloads with separate channels, by the name of their schema.
-PAYLOADS: dict[str, type] = {
-    **{
-        f"foxglove.{payload.__name__}": payload
-        for payload in (
-            messages.CameraCalibration,
-            messages.CompressedImage,
-            messages.CompressedVideo,
-            messages.FrameTransforms,
-            messages.ImageAnnotations,
-            messages.RawImage,
-        )
-    },
-    **{
-        f"ipsys.v1.{payload.__name__}": payload
-        for payload in (
-            messages.CameraPoints,
-            messages.CameraPoses,
-            messages.ClockEstimate,
-            messages.Cut,
-            messages.Evaluation,
-            messages.Event,
-            messages.Latency,
-            messages.Markers,
-            messages.Measurement,
-            messages.Merge,
-            messages.Model,
-            messages.Positions,
-            messages.Rig,
-            messages.RobotPath,
-            messages.Run,
-            messages.Tracks,
-            messages.WheelCommand,
-        )
-    },
-}
-_LONG = 32 << 10  # bytes
-_ITEMS_OF_ONE = 1 << 20
-_NAMES = {payload: name for name, payload in PAYLOADS.items()}
+_OF_FOXGLOVE = (
+    *(messages.CameraCalibration, messages.CompressedImage, messages.CompressedVideo, messages.RawImage),
+    *(messages.FrameTransforms, messages.ImageAnnotations),
+)
 
 
 def schema_name(payload: type) -> str:
     """Return the name of the schema for a type of payload, such as ``ipsys.v1.Markers``."""
-    return _NAMES[payload]
+    return f"{'foxglove' if payload in _OF_FOXGLOVE else 'ipsys.v1'}.{payload.__name__}"
+
+
+_STORED = {payload for channel in CHANNELS for payload in channel.payloads} - {messages.SkippedVideo}
+# The payloads of the channels, by the name of their schema.
+PAYLOADS: dict[str, type] = {schema_name(kind): kind for kind in sorted(_STORED, key=schema_name)}
+_LONG = 32 << 10  # bytes
+_ITEMS_OF_ONE = 1 << 20
 
 
 def payload_type(name: str) -> type | None:

@@ -231,13 +231,7 @@ class Session:
     def encoded(
         self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[tuple[str, int, int, bytes]]:
-        """Yield topic, log time, publish time and encoded payload of messages in log order.
-
-        Raises
-        ------
-        LogError
-            A channel is not encoded with protobuf, or a message is too large.
-        """
+        """Yield topic, log time, publish time and encoded payload of messages in log order."""
         for reader in self.readers:
             for topic in topics:
                 if topic in reader.channels and reader.channels[topic].message_encoding != "protobuf":

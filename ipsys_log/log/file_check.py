@@ -41,11 +41,6 @@ def check_file(
     contents : the table of contents that readers use.
     stored : the hashes that writers stored in the log, by topic.
     watch : follows the reading.
-
-    Raises
-    ------
-    BoundError
-        The log exceeds the limits of its file size.
     """
     survey = Survey(view, read_intact_summary(view), watch)
     faults = _faults_before(contents.data_end, survey) if contents.cut_short else _faults(view, survey)

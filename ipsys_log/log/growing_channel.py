@@ -42,13 +42,7 @@ class GrowingChannel:
             self._view.close()
 
     def read(self, number: int) -> Any:
-        """Return the payload of a message; None if the file does not hold it yet.
-
-        Raises
-        ------
-        LogError
-            The file cannot be read.
-        """
+        """Return the payload of a message; None if the file does not hold it yet."""
         if number >= len(self._places):
             self._extend()
         if number >= len(self._places):

@@ -47,13 +47,7 @@ def one_reading() -> Iterator[None]:
 
 
 def open_remote(url: LogUrl) -> RemoteBytes:
-    """Open a log at a URL; within one reading, all readers share its cache.
-
-    Raises
-    ------
-    LogError
-        The log cannot be found, or its protocol is not known.
-    """
+    """Open a log at a URL; within one reading, all readers share its cache."""
     reading = _reading.get()
     if reading is None:
         return RemoteBytes.open(url)
@@ -63,13 +57,7 @@ def open_remote(url: LogUrl) -> RemoteBytes:
 
 
 def contents_of(view: LogBytes) -> Contents:
-    """Return the table of contents of an open log, which the caller may change.
-
-    Raises
-    ------
-    LogError
-        As :func:`~ipsys_log.log.summary.load_contents`.
-    """
+    """Return the table of contents of an open log, which the caller may change."""
     from ipsys_log.log.summary import load_contents
 
     reading = _reading.get()

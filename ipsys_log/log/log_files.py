@@ -34,13 +34,7 @@ def read_log_state(log: LogLocation) -> LogState:
 
 
 def find_logs(texts: Iterable[str | os.PathLike[str] | LogUrl]) -> list[LogLocation]:
-    """Return the locations of logs; a URL with ``*`` or ``[`` gives all objects that match, by name.
-
-    Raises
-    ------
-    IpsysError
-        A pattern matches nothing, or its store cannot be listed.
-    """
+    """Return the locations of logs; a URL with ``*`` or ``[`` gives all objects that match, by name."""
     found: list[LogLocation] = []
     for location in map(parse_location, texts):
         if isinstance(location, LogUrl) and location.is_pattern:
@@ -55,11 +49,6 @@ def expand_folders(logs: Iterable[LogLocation]) -> list[LogLocation]:
 
     A URL that ends with ``/`` is a folder. A log that is named twice, or by a link, is returned once.
 
-    Raises
-    ------
-    IpsysError
-        A folder has no logs, or the protocol of a URL is not known.
-
     Examples
     --------
     >>> expand_folders([Path("b.mcap"), Path("a.mcap"), Path("./b.mcap")])
@@ -73,11 +62,6 @@ def name_places(logs: Iterable[LogLocation]) -> dict[LogLocation, PurePath]:
 
     It is the path below the folder or the pattern that names the log. Logs with the same path get the path
     below their common folder.
-
-    Raises
-    ------
-    IpsysError
-        As :func:`expand_folders`.
 
     Examples
     --------
@@ -141,11 +125,6 @@ def logs_below(folder: Path) -> list[Path]:
     """Return all files below a folder whose name ends in ``.mcap``, sorted by path.
 
     A link without a file is returned, too: perhaps its disk is not mounted, and the user must know.
-
-    Raises
-    ------
-    IpsysError
-        There is no such folder.
     """
     if not folder.is_dir():
         raise IpsysError(f"{folder}: is not a folder; name a folder with logs")
@@ -158,11 +137,6 @@ def states_below(folder: LogLocation) -> Iterator[tuple[str, LogLocation, LogSta
 
     The state is None for a file that does not exist any more, and for a link without a file. The lists of an
     object store have the states, so an unchanged object needs no request of its own.
-
-    Raises
-    ------
-    IpsysError
-        There is no such folder, or the store cannot be listed.
     """
     if isinstance(folder, Path):
         for path in logs_below(folder):
@@ -203,24 +177,12 @@ def _logs_of(location: LogLocation) -> Iterator[LogLocation]:
 
 
 def _list_objects(pattern: LogUrl) -> list[LogUrl]:
-    """Return the objects that match a pattern, by name.
-
-    Raises
-    ------
-    LogError
-        Nothing matches, or the store cannot be listed.
-    """
+    """Return the objects that match a pattern, by name."""
     return list(_list_entries(pattern))
 
 
 def _list_states(pattern: LogUrl) -> dict[LogUrl, LogState | None]:
-    """Return the objects that match a pattern, by name, with their states; None if the list has no sizes.
-
-    Raises
-    ------
-    LogError
-        Nothing matches, or the store cannot be listed.
-    """
+    """Return the objects that match a pattern, by name, with their states; None if the list has no sizes."""
     return {url: _state_of_entry(entry) for url, entry in _list_entries(pattern).items()}
 
 

@@ -22,11 +22,6 @@ def check_overlaps(readers: Sequence[LogReader], image_topics: Collection[str]) 
     """Refuse logs that have images of the same camera, or results of the same run, at the same time.
 
     Sessions one after the other may have runs of the same name: such a run is read as one.
-
-    Raises
-    ------
-    LogError
-        The text names the topic and both logs.
     """
     first: dict[str, LogReader] = {}
     for reader in readers:
@@ -56,14 +51,7 @@ def _overlap(one: LogReader, other: LogReader, topic: str) -> bool:
 def check_same_parameters(logs: Iterable[tuple[LogLocation, Iterable[Run]]]) -> None:
     """Refuse logs in which a stage made a run of the same name in different ways.
 
-    Parameters
-    ----------
-    logs : the path of each log, and the records of its runs.
-
-    Raises
-    ------
-    LogError
-        The text names the run and both logs.
+    ``logs`` has the path of each log, and the records of its runs.
     """
     known: dict[tuple[str, str], tuple[LogLocation, Mapping[str, str]]] = {}
     for path, runs in logs:
@@ -135,13 +123,7 @@ class MergeSource:
     metadata: Mapping[str, str] = field(default_factory=dict)
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[RawMessage]:
-        """Yield the messages of some topics as they are in the new log, in log order; None means all.
-
-        Raises
-        ------
-        LogError
-            A message is damaged, or its times cannot be shifted.
-        """
+        """Yield the messages of some topics as they are in the new log, in log order; None means all."""
         wanted = [topic for topic in self.topics if topics is None or topic in topics]
         schemas = {topic: self.reader.channels[topic].schema for topic in wanted}
         names = {topic: schema.name if schema else "" for topic, schema in schemas.items()}
@@ -207,13 +189,7 @@ _TIMESTAMP = "google.protobuf.Timestamp"
 
 
 def check_shift(channel: StoredChannel) -> None:
-    """Refuse a channel with times that cannot be shifted.
-
-    Raises
-    ------
-    LogError
-        The channel has known messages in another encoding than protobuf.
-    """
+    """Refuse a channel with times that cannot be shifted."""
     is_known = channel.schema is not None and payload_type(channel.schema.name) is not None
     if is_known and channel.message_encoding != "protobuf":
         raise LogError(
@@ -223,13 +199,7 @@ def check_shift(channel: StoredChannel) -> None:
 
 
 def shift_time(time_ns: int, offset_ns: int) -> int:
-    """Return a shifted time in ns; 0 means that a time is missing, and stays 0.
-
-    Raises
-    ------
-    LogError
-        The shifted time is before 1970 or after 2554, or is 0.
-    """
+    """Return a shifted time in ns; 0 means that a time is missing, and stays 0."""
     if time_ns == 0:
         return 0
     shifted_ns = time_ns + offset_ns
@@ -240,16 +210,6 @@ def shift_time(time_ns: int, offset_ns: int) -> int:
 
 def shift_times(name: str, data: bytes, offset_ns: int) -> bytes:
     """Return a message with all its times shifted; a message of an unknown schema stays the same.
-
-    Parameters
-    ----------
-    name : the name of its schema.
-    data : the message, encoded with protobuf.
-
-    Raises
-    ------
-    LogError
-        The message is not valid, or a time cannot be shifted.
 
     Examples
     --------

@@ -74,13 +74,7 @@ def _copy_chosen(reader: LogReader, writer: LogWriter, chunk: ChunkRef, choose: 
 
 
 def copy_records(reader: LogReader, writer: LogWriter) -> None:
-    """Copy the attachments and the metadata of a log; the stored hashes of its channels are left out.
-
-    Raises
-    ------
-    LogError
-        A record is not at its place.
-    """
+    """Copy the attachments and the metadata of a log; the stored hashes of its channels are left out."""
     view, contents = reader.view, reader.contents
     for index in contents.attachments:
         _copy_record(view, writer, index, Opcode.ATTACHMENT)
@@ -144,13 +138,7 @@ class _Message(NamedTuple):
 
 
 def _messages(view: LogBytes, entries: Entries, read: Callable[[int, int], Buffer]) -> Iterator[_Message]:
-    """Yield the messages of message indexes in the order of the file.
-
-    Raises
-    ------
-    LogError
-        An index points to no message of its time.
-    """
+    """Yield the messages of message indexes in the order of the file."""
     rows = np.concatenate([*entries.values()])
     for time_ns, offset in rows[np.argsort(rows[:, 1], kind="stable")].tolist():
         start = offset + MESSAGE_HEAD_SIZE

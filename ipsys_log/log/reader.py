@@ -52,11 +52,6 @@ class LogReader:
     Other programs write several channels with one topic. They are read as one channel. A reader stays
     consistent while another process appends: it shows the log at the time of opening.
 
-    Parameters
-    ----------
-    path
-        The ``.mcap`` file, or the URL of one.
-
     Attributes
     ----------
     channels : Mapping[str, Channel]
@@ -261,11 +256,6 @@ class LogReader:
 
         The hash does not depend on the chunks and files of the messages. The stored hash of the writer is
         used if it matches the log; else the channel is read once.
-
-        Raises
-        ------
-        LogError
-            The log has no such topic, or a record of it is damaged.
         """
         if topic not in self.channels:
             raise LogError(

@@ -195,13 +195,7 @@ class RecordSearch:
         return is_near and (is_consistent or channel in self.channels)
 
     def parse_definition(self, record: records.RecordAt) -> mcap.Schema | mcap.Channel | None:
-        """Parse a Schema or Channel record; check a Metadata record, too.
-
-        Raises
-        ------
-        LogError
-            A length or an id in the record is wrong.
-        """
+        """Parse a Schema or Channel record; check a Metadata record, too."""
         if record.opcode not in _DEFINITIONS:
             return None
         if record.length > LARGEST_DEFINITION:

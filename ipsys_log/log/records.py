@@ -218,13 +218,7 @@ def parse_message_index(view: LogBytes, data: bytes, position: int, channel_id: 
 
 
 def attachment_crcs(view: LogBytes, record: RecordAt) -> tuple[int, int]:
-    """Return the stated CRC of an attachment (0: none), and its computed CRC.
-
-    Raises
-    ------
-    LogError
-        The record has wrong lengths.
-    """
+    """Return the stated CRC of an attachment (0: none), and its computed CRC."""
     head = view.read(record.offset, min(record.length, _LONGEST_ATTACHMENT_HEAD))
     try:
         (name,) = struct.unpack_from("<I", head, HEADER.size + 16)

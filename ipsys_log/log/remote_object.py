@@ -105,13 +105,7 @@ def changed_ns_of(entry: Mapping[str, Any]) -> int | None:
 
 
 def repeat_request(url: LogUrl, ask: Callable[[], T]) -> T:
-    """Return the answer to a request; repeat it some times if its failure may pass.
-
-    Raises
-    ------
-    LogError
-        One line: the failure, and what to do.
-    """
+    """Return the answer to a request; repeat it some times if its failure may pass."""
     pauses_s = _pauses_s(url)
     for pause_s in (*pauses_s, None):
         try:
@@ -238,13 +232,7 @@ class RemoteObject:
 
 
 def open_object(url: LogUrl) -> RemoteObject:
-    """Look up an object: one request for its size and version.
-
-    Raises
-    ------
-    LogError
-        The protocol is not known, its package is missing, or the object cannot be found.
-    """
+    """Look up an object: one request for its size and version."""
     filesystem, path = open_filesystem(url)
     open_pinned = _OPENERS.get(url.scheme, _open_and_look)
     entry, read = repeat_request(url, lambda: open_pinned(filesystem, path))
@@ -258,13 +246,7 @@ def open_object(url: LogUrl) -> RemoteObject:
 
 
 def read_state(url: LogUrl) -> LogState:
-    """Return the state of one object, in one request.
-
-    Raises
-    ------
-    LogError
-        As :func:`open_object`.
-    """
+    """Return the state of one object, in one request."""
     source = open_object(url)
     return LogState(source.size, source.changed_ns, "; ".join(source.version))
 

@@ -120,13 +120,7 @@ def read_intact_summary(view: LogBytes) -> Summary | None:
 
 
 def read_summary(view: LogBytes) -> Summary | None:
-    """Read only the summary; None if the log has none.
-
-    Raises
-    ------
-    LogError
-        The end of the log is missing or damaged.
-    """
+    """Read only the summary; None if the log has none."""
     footer_at, summary_start, checked = _footer(view)
     if not summary_start:
         return None

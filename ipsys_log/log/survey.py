@@ -179,13 +179,7 @@ class Survey:
         return record.offset + record.length
 
     def _take(self, position: int) -> int:
-        """Check the bytes at `position` and add them; return their end.
-
-        Raises
-        ------
-        LogError
-            No whole record is there.
-        """
+        """Check the bytes at `position` and add them; return their end."""
         view = self.view
         if position == self.search.frame_at:
             return self._take_frame(position)

@@ -191,13 +191,7 @@ class LogWriter:
         """The descriptor of the file until it is closed."""
         return self._output.fd
 
-    def add_channel(
-        self,
-        topic: str,
-        schema: Schema | None,
-        message_encoding: str = "protobuf",
-        metadata: Mapping[str, str] | None = None,
-    ) -> None:
+    def add_channel(self, topic: str, schema: Schema | None, message_encoding: str = "protobuf") -> None:
         """Declare a channel; a second call with the same schema does nothing.
 
         An append continues a channel of the log with the same topic and schema. If the schema now has more
@@ -217,13 +211,8 @@ class LogWriter:
             if (channel.topic, channel.schema_id) == (topic, schema_id):
                 break
         else:
-            channel = mcap.Channel(
-                self._free_id(self._contents.channels),
-                topic,
-                message_encoding,
-                dict(metadata or {}),
-                schema_id,
-            )
+            channel_id = self._free_id(self._contents.channels)
+            channel = mcap.Channel(channel_id, topic, message_encoding, {}, schema_id)
             self._output.emit(to_bytes(channel))
             self._contents.channels[channel.id] = channel
         self._select(topic, channel.id, schema)
@@ -233,11 +222,6 @@ class LogWriter:
         """Declare a channel of another log; return its id here, which is the same if this id is free.
 
         A channel with the same topic, schema and metadata is continued.
-
-        Raises
-        ------
-        LogError
-            The log has this topic with a schema of another name, or another encoding.
         """
         self._check_open()
         own = Schema(schema.name, schema.encoding, schema.data) if schema else None
@@ -255,13 +239,7 @@ class LogWriter:
         return same.id
 
     def define(self, record: mcap.Schema | mcap.Channel) -> None:
-        """Write a definition of a damaged log as it is; its id must be free here.
-
-        Raises
-        ------
-        LogError
-            The log has the topic of the channel with a schema of another name, or another encoding.
-        """
+        """Write a definition of a damaged log as it is; its id must be free here."""
         if isinstance(record, mcap.Schema):
             self._contents.schemas[record.id] = record
         else:

@@ -76,11 +76,6 @@ def check_rig_cameras(rig: Rig, cameras: Collection[str], where: str) -> list[st
     Returns
     -------
     A remark if the rig does not describe some of the cameras.
-
-    Raises
-    ------
-    IpsysError
-        The rig describes only other cameras.
     """
     described = [camera.name for camera in rig.cameras]
     missing = sorted(set(cameras) - set(described))
@@ -330,13 +325,7 @@ def _check_stream(stream: RigStream, rig: Rig, where: str) -> None:
 
 
 def check_robots(rig: Rig, robots: Collection[str], where: str) -> None:
-    """Check that a rig has some robots; a rig without markers has a robot ``marker_<id>`` for each id.
-
-    Raises
-    ------
-    IpsysError
-        The rig has no robot of a name.
-    """
+    """Check that a rig has some robots; a rig without markers has a robot ``marker_<id>`` for each id."""
     known = {rig.robot_of(marker.id) for marker in rig.markers}
     for robot in robots:
         if robot not in known if known else not _MARKER.fullmatch(robot):

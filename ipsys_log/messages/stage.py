@@ -162,10 +162,6 @@ class Resets:
     The instants depend on the log time and the name of the camera only. So a cut keeps them, and the frames
     of a camera between two resets can be processed without the frames before them.
 
-    Parameters
-    ----------
-    period_ns : time between two resets of a camera.
-
     Examples
     --------
     >>> resets = Resets(30_000_000_000)

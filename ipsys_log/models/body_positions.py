@@ -8,12 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ipsys_log.calibration.joint.locate import corner_covariances
-from ipsys_log.calibration.joint.locate_bodies import (
-    BodyPoses,
-    BodySightings,
-    locate_bodies,
-    strongest_modes,
-)
+from ipsys_log.calibration.joint.locate_bodies import BodyPoses, BodySightings, locate_bodies, strongest_modes
 from ipsys_log.calibration.joint.model import JointModel
 from ipsys_log.messages import Array, Event, Marker, Position, Rig
 from ipsys_log.messages.events import LOOSE_MARKER

@@ -5,8 +5,6 @@ References
 Ou et al., Robotica 2023, sect. 2.2.1 and 2.2.2: rigid transformation and polynomial regression.
 """
 
-from __future__ import annotations
-
 from functools import cache
 from typing import ClassVar, Self
 

@@ -112,13 +112,7 @@ def is_known(name: str) -> bool:
 
 
 def check_name(name: str) -> None:
-    """Check that a model is known.
-
-    Raises
-    ------
-    IpsysError
-        This version does not have the model.
-    """
+    """Check that a model is known."""
     if not is_known(name):
         known = ", ".join(MODELS + CORNER_MODELS)
         raise IpsysError(f"model {name!r} is not known; use one of {known}")
@@ -135,13 +129,7 @@ def model_run(name: str) -> str:
 
 
 def create(name: str) -> Any:
-    """Return an unfitted estimator by its name in :data:`MODELS`.
-
-    Raises
-    ------
-    IpsysError
-        The model is unknown, or is a model of corners.
-    """
+    """Return an unfitted estimator by its name in :data:`MODELS`."""
     check_name(name)
     if reads_corners(name):
         raise IpsysError(
@@ -249,13 +237,7 @@ def parameters(estimator: Any) -> dict[str, NDArray[np.float64]]:
 
 
 def restore(name: str, arrays: Mapping[str, NDArray[np.float64]]) -> Any:
-    """Return the model ``name`` with parameters from :func:`parameters`, for :func:`predict_array`.
-
-    Raises
-    ------
-    IpsysError
-        The model is unknown, or a parameter is missing.
-    """
+    """Return the model ``name`` with parameters from :func:`parameters`, for :func:`predict_array`."""
     estimator = _new(name)
     for part, (prefix, step) in zip(name.split("+"), _steps(estimator), strict=True):
         step.n_features_in_ = 4 if MODEL_PARTS[part].reads_height else 3

@@ -278,9 +278,7 @@ def _kept(fitted: Array, residuals: Array) -> float:
 class Volume:
     """The volume of the calibration points: their convex hull in the camera's x and y, and their heights.
 
-    Parameters
-    ----------
-    points_m, world_m : (n, 3), camera points and world points of the calibration points.
+    Both are those of the camera points and the world points (n, 3) of the calibration.
     """
 
     def __init__(self, points_m: Array, world_m: Array) -> None:

@@ -62,13 +62,7 @@ export default function script(event: any): Output | undefined {
 
 
 def make_layout(session: Session, runs: Sequence[str] = ()) -> dict[str, Any]:
-    """Return the layout of a log as plain data for JSON; of several runs, the first one is shown.
-
-    Raises
-    ------
-    IpsysError
-        A run is unknown.
-    """
+    """Return the layout of a log as plain data for JSON; of several runs, the first one is shown."""
     shown = choose_runs(session, runs)
     rig = rig_in_force(session, [run for run in (shown.markers, *shown.runs) if run])
     images = {f"Image!{camera}": _image(session, shown, camera) for camera in sorted(session.images)}

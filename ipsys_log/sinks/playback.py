@@ -46,13 +46,7 @@ class PlaybackOptions:
 
 
 def check_rate(rate: float) -> None:
-    """Check the rate of a playback.
-
-    Raises
-    ------
-    IpsysError
-        The rate is too small or too large.
-    """
+    """Check the rate of a playback."""
     if not SLOWEST <= rate <= FASTEST:
         raise IpsysError(f"rate {rate:g}: give a number from {SLOWEST:g} to {FASTEST:g}")
 

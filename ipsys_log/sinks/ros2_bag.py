@@ -61,11 +61,6 @@ def write_bag(
     ----------
     run : the run of the tracks.
     robots : the names of the robots; empty: all.
-
-    Raises
-    ------
-    IpsysError
-        The file exists, there are no such robots, or images are video.
     """
     if path.exists():
         raise IpsysError(f"{path}: exists already; choose another name")

@@ -56,13 +56,7 @@ class Shown:
 
 
 def choose_runs(session: Session, names: Sequence[str] = ()) -> Shown:
-    """Choose the runs to show: the named runs with the markers that they use, or the newest runs.
-
-    Raises
-    ------
-    IpsysError
-        No complete run has one of the names.
-    """
+    """Choose the runs to show: the named runs with the markers that they use, or the newest runs."""
     records = session.runs()
     known = list(dict.fromkeys(record.run for record in records))
     for name in names:
@@ -183,11 +177,6 @@ def choose_topics(session: Session, run: str | None = None, names: Sequence[str]
     ----------
     run : the run of the tracks; None: the newest complete one.
     names : topics of the log instead, one of them with tracks.
-
-    Raises
-    ------
-    IpsysError
-        The log has no tracks, no such run or no such topic, or two of the topics have tracks.
     """
     runs = {topic: name for name in sorted(session.run_names()) for topic in session.topics(TRACKS, name)}
     tracks: dict[str, str | None] = {**runs, **dict.fromkeys(session.topics(TRUTH))}

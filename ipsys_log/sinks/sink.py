@@ -59,9 +59,7 @@ Sink = InlineSink | QueuedSink | Callable[[Message], None]
 class DropReport:
     """The number of messages that a sink lost. Events report the 1st, the 10th, the 100th loss, and so on.
 
-    Parameters
-    ----------
-    name : the name of the sink in the events.
+    ``name`` is the name of the sink in the events.
     """
 
     def __init__(self, name: str, warn: Warn) -> None:
@@ -148,9 +146,7 @@ class FanOut:
     Inline sinks get a message at once, before the functions among the sinks. A sink that raises an error gets
     no more messages: an event reports the error, and the recording goes on.
 
-    Parameters
-    ----------
-    warn : makes an event of a kind and a text, and prints it; called from any thread.
+    ``warn`` makes an event of a kind and a text, and prints it; any thread may call it.
     """
 
     def __init__(self, sinks: Sequence[Sink], warn: Warn) -> None:

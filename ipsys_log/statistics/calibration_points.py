@@ -39,13 +39,7 @@ class TimedPoints:
 
 
 def gather_sightings(messages: Iterable[Message]) -> dict[tuple[str, int], TimedPoints]:
-    """Return camera points by camera and marker, ordered by the time of exposure of the marker.
-
-    Raises
-    ------
-    IpsysError
-        A point is not a number, or its distance is impossible in a lab.
-    """
+    """Return camera points by camera and marker, ordered by the time of exposure of the marker."""
     rows: dict[tuple[str, int], list[tuple[int, float, float, float]]] = {}
     for message in messages:
         if isinstance(message.payload, CameraPoints):
@@ -74,11 +68,6 @@ def valid_measurements(messages: Iterable[Message], override: Rig | None) -> lis
     ----------
     messages : rigs and measurements, in log order. The first rig is also valid for measurements before it.
     override : a rig that replaces the rigs of all measurements.
-
-    Raises
-    ------
-    IpsysError
-        Two measurements have the same id, a measurement has no marker, or there is no rig.
     """
     rigs: list[Rig] = [override] if override is not None else []
     numbered: list[tuple[Measurement, int]] = []
@@ -99,11 +88,6 @@ def active_measurements(measurements: Iterable[Measurement]) -> list[Measurement
     """Return the measurements that are not withdrawn, in their order.
 
     A re-admitted measurement has its former place in the order.
-
-    Raises
-    ------
-    IpsysError
-        Two of these measurements have the same id, or one has no marker.
     """
     points: dict[str, Measurement] = {}
     withdrawn: dict[str, Measurement] = {}
@@ -159,11 +143,6 @@ def _follow(withdrawn: dict[str, Measurement], message: Measurement) -> None:
 
 def still_interval(sightings: TimedPoints, time_ns: int) -> tuple[int, int] | None:
     """Return the stationary interval of a marker around a time.
-
-    Parameters
-    ----------
-    sightings : sightings of one marker by one camera.
-    time_ns : time of the measurement.
 
     Returns
     -------
@@ -268,11 +247,6 @@ def split(measurements: Iterable[Measurement], train: str, seed: int) -> tuple[s
     measurements : the valid measurements.
     train : the label of the subset for the fit; ``test`` is the label of held-out measurements.
     seed : random seed. If no measurement has a label, a random fifth of them is held out.
-
-    Raises
-    ------
-    IpsysError
-        Measurements have labels, but no measurement has the label ``train``.
     """
     measurements = list(measurements)
     labels = sorted({label for m in measurements for label in m.splits} - {"test"})

@@ -166,11 +166,6 @@ def score_estimate(
     rotations : of the body of the estimate and of the marker, to the lab, at the instants of the estimate,
         each (n, 3, 3); None for a level robot, which has headings alone.
 
-    Raises
-    ------
-    IpsysError
-        Fewer than three instants have a track.
-
     References
     ----------
     Alignments and errors: Grupp, evo, 2017 (``evo_ape``, ``evo_rpe --all_pairs --pairs_from_reference``);
@@ -217,13 +212,7 @@ def score_estimate(
         float(np.sqrt(variances_m2[has_variance].mean())) if has_variance.any() else None,
         _coverage(estimate.times_ns, tracks, frame.pivot_m),
         _drift(scaled),
-        _nees(
-            pairs,
-            first or rows[1],
-            (estimate.covariances_m2[known], cov_m2[known]),
-            sigmas_rad,
-            yaw,
-        ),
+        _nees(pairs, first or rows[1], (estimate.covariances_m2[known], cov_m2[known]), sigmas_rad, yaw),
     )
 
 

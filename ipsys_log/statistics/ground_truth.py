@@ -269,8 +269,7 @@ def pool_trajectories(trajectories: Sequence[TrajectoryErrors]) -> TrajectoryErr
     kinds = dict.fromkeys((r.delta, r.unit, r.relation) for one in trajectories for r in one.relative)
     relative = [
         RelativeErrors(
-            *kind,
-            np.concatenate([r.errors_m for one in trajectories for r in one.relative if r[:3] == kind]),
+            *kind, np.concatenate([r.errors_m for one in trajectories for r in one.relative if r[:3] == kind])
         )
         for kind in kinds
     ]
@@ -336,10 +335,7 @@ def relative_errors(
     if is_turned := bool(pairs.is_turned.any()):
         pairs = pairs.part(pairs.is_turned)
     steps_m = np.linalg.norm(np.diff(pairs.true_m, axis=0), axis=1)
-    passed = {
-        "m": np.append(0.0, np.cumsum(steps_m)),
-        "s": (pairs.times_ns - pairs.times_ns[0]) / NS_PER_S,
-    }
+    passed = {"m": np.append(0.0, np.cumsum(steps_m)), "s": (pairs.times_ns - pairs.times_ns[0]) / NS_PER_S}
     intervals_s = np.diff(passed["s"])
     half_s = _INTERVAL_SHARE * float(np.median(intervals_s)) if len(intervals_s) else 0.0
     found = []

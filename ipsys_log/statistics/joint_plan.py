@@ -55,13 +55,7 @@ def expect_on_floor(
     height_m: float,
     length_m: float,
 ) -> list[ExpectedErrors]:
-    """Return the expected errors of all cameras over the floor, see :func:`expect_errors`.
-
-    Raises
-    ------
-    IpsysError
-        No camera sees a whole marker anywhere.
-    """
+    """Return the expected errors of all cameras over the floor, see :func:`expect_errors`."""
     expected = expect_errors(models, sizes_px, grid, height_m, length_m)
     if not any(len(one.errors_m) for one in expected):
         raise IpsysError(f"no camera sees a whole marker {height_m:g} m above the floor; give another height")
@@ -84,11 +78,6 @@ def plan_joint_points(
     tape_m2 : function for the covariances of tape readings.
     count : number of points.
     progress : called after each point.
-
-    Raises
-    ------
-    IpsysError
-        No camera sees a candidate.
     """
     flat_m, heights_m = candidates_m[:, :2], candidates_m[:, 2]
     points = choose_points(expected, flat_m, tape_m2, 0.0, count, heights_m, progress)

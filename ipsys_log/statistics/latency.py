@@ -223,13 +223,7 @@ class PositionMonitor:
 
 
 def recorded_latencies(paths: Sequence[LogLocation]) -> list[Latency]:
-    """Return the latency ledger of a log.
-
-    Raises
-    ------
-    IpsysError
-        The log has no latencies.
-    """
+    """Return the latency ledger of a log."""
     with Session(paths) as session:
         latencies: list[Latency] = session.payloads(session.topics(LATENCY))
         if not latencies:

@@ -42,14 +42,7 @@ class Contradiction(NamedTuple):
 
 
 class SizeTest:
-    """The test of one camera, as markers arrive; each contradiction is returned once.
-
-    Parameters
-    ----------
-    camera : name of the camera, for texts.
-    lens : intrinsics of the camera.
-    rig : lengths and heights of the markers.
-    """
+    """The test of one camera, as markers arrive; each contradiction is returned once."""
 
     def __init__(self, camera: str, lens: CameraCalibration, rig: Rig) -> None:
         self.camera, self.lens, self.rig = camera, lens, rig
@@ -244,13 +237,7 @@ _FITTED_PX = 1e-4
 
 
 class IntrinsicsTest:
-    """The test of the intrinsics of one camera, as markers arrive; a contradiction is returned once.
-
-    Parameters
-    ----------
-    camera : name of the camera, for texts.
-    lens : intrinsics of the camera.
-    """
+    """The test of the intrinsics of one camera, as markers arrive; a contradiction is returned once."""
 
     def __init__(self, camera: str, lens: CameraCalibration) -> None:
         self.camera, self.lens = camera, lens

@@ -257,13 +257,7 @@ class PointModels:
         return fitted
 
     def evaluate(
-        self,
-        model: Model,
-        view: StageView,
-        study: Study,
-        time_ns: int,
-        notes: list[str],
-        progress: Progress,
+        self, model: Model, view: StageView, study: Study, time_ns: int, notes: list[str], progress: Progress
     ) -> Evaluation:
         """Compute the errors of a model; add remarks to ``notes``."""
         return evaluate_model(model, study, time_ns, notes, progress)
@@ -333,12 +327,7 @@ class CornerModels:
         """Check nothing: a drive is enough."""
 
     def fit(
-        self,
-        name: str,
-        view: StageView,
-        train: Collection[str],
-        notes: list[str],
-        progress: Progress,
+        self, name: str, view: StageView, train: Collection[str], notes: list[str], progress: Progress
     ) -> Model:
         from ipsys_log.statistics.joint_evaluation import fit_joint_model
 

@@ -277,11 +277,6 @@ def describe_outlier(
     predicted_m : (3,), the point by all other observations.
     usual_m2 : (3, 3), covariance of the prediction.
     score : size of its error in units of the usual error.
-
-    Raises
-    ------
-    IpsysError
-        The measurement forms no world point.
     """
     place = replace(place, rig=with_usual_tape(place.rig))
     residual_m = predicted_m - world_point(place.measurement, place.rig).world_m

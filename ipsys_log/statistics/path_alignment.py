@@ -20,12 +20,7 @@ from ipsys_log.statistics.ground_truth import LONGEST_GAP_NS
 from ipsys_log.statistics.path_cleaning import REPEATED, repeated, select_rows
 from ipsys_log.statistics.path_fit import LEAST_INSTANTS, PathFit, State, free_scale, linearize
 from ipsys_log.statistics.path_pairs import Body
-from ipsys_log.statistics.path_problem import (
-    NO_AGREEMENT,
-    ChosenFit,
-    Problem,
-    extent_m,
-)
+from ipsys_log.statistics.path_problem import NO_AGREEMENT, ChosenFit, Problem, extent_m
 from ipsys_log.statistics.trajectories import KnownParts, Trajectory, TrajectoryPair
 from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.poses import cross, rotation_vector
@@ -233,13 +228,7 @@ def align_trajectories(pairs: Sequence[TrajectoryPair], known: KnownParts, where
 
 
 def _result(problem: Problem, fit: ChosenFit) -> PathAlignment:
-    """Return the alignment with its standard deviations and remarks.
-
-    Raises
-    ------
-    IpsysError
-        The motion does not determine the clock or the rotation.
-    """
+    """Return the alignment with its standard deviations and remarks."""
     measured, drifting = fit.measured, fit.drifting
     state, sigma = measured.state, measured.sigma
     turn_sigmas_rad, shift_sigmas_m = _motion_sigmas(measured)

@@ -12,13 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.messages import Array, Indices
-from ipsys_log.statistics.path_fit import (
-    LEAST_INSTANTS,
-    LEAST_M,
-    LEAST_RAD,
-    PRIOR_LOG_SCALE,
-    PRIOR_PIVOT_M,
-)
+from ipsys_log.statistics.path_fit import LEAST_INSTANTS, LEAST_M, LEAST_RAD, PRIOR_LOG_SCALE, PRIOR_PIVOT_M
 from ipsys_log.statistics.path_noise import factorize
 from ipsys_log.statistics.path_pairs import Body, smooth_values
 

@@ -11,14 +11,7 @@ from ipsys_log.messages import Array
 from ipsys_log.statistics import path_cleaning, path_fit
 from ipsys_log.statistics.ground_truth import TrackedPath, last_poses
 from ipsys_log.statistics.path_drift import ROUNDS, DriftFit, fit_drifting
-from ipsys_log.statistics.path_pairs import (
-    Body,
-    PathPair,
-    search_speeds,
-    search_turns,
-    smooth_values,
-    thin,
-)
+from ipsys_log.statistics.path_pairs import Body, PathPair, search_speeds, search_turns, smooth_values, thin
 from ipsys_log.statistics.trajectories import KnownParts, Trajectory, TrajectoryPair
 from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.poses import rotate, rotation_between
@@ -259,13 +252,7 @@ class Problem:
         return _Candidate(fit.state.offset_s, fit.likelihood, int(fit.kept.sum()), None)
 
     def refined(self, candidates: Sequence[_Candidate]) -> ChosenFit:
-        """Return the fit with all instants at the best candidate.
-
-        Raises
-        ------
-        IpsysError
-            The paths differ.
-        """
+        """Return the fit with all instants at the best candidate."""
         first = candidates[0]
         fit = self._refined(first)
         if fit is None or self._differs(fit):

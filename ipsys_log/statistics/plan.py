@@ -144,11 +144,6 @@ def plan_points(
     count : number of calibration points to choose.
     progress : called after each point.
 
-    Raises
-    ------
-    IpsysError
-        There are no candidates, or no camera sees a marker at their height or on the floor.
-
     References
     ----------
     V-optimality, also called I-: Atkinson, Donev and Tobias, Optimum Experimental Designs, 2007, ch. 10.

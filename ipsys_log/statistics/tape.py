@@ -110,10 +110,6 @@ def world_point(measurement: Measurement, rig: Rig) -> TapePoint:
         laid onto a reference point.
     rig : rig with the reference points and the tape; not used if there is only a world point.
 
-    Returns
-    -------
-    TapePoint : the world point, its covariance, and the residuals of the distances.
-
     Raises
     ------
     IpsysError
@@ -156,11 +152,6 @@ def world_point(measurement: Measurement, rig: Rig) -> TapePoint:
 def reference_points(measurement: Measurement, rig: Rig) -> Array:
     """Return the reference point of each tape distance, (n, 2) in m.
 
-    Raises
-    ------
-    IpsysError
-        A reference point is not in the rig.
-
     Examples
     --------
     >>> from ipsys_log.messages import Distance, ReferencePoint
@@ -184,11 +175,6 @@ def find_weak_points(places: Iterable[RiggedMeasurement]) -> list[WeakPoint]:
     If the circles cross at a right angle, a point is as accurate as the tape. At 27 degrees, or near the line
     through the reference points, the standard deviation is three times larger. Measurements with a world
     point alone are skipped.
-
-    Raises
-    ------
-    IpsysError
-        See :func:`world_point`.
 
     Examples
     --------

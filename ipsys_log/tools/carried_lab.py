@@ -1,6 +1,4 @@
-"""Calibration of the cameras of a lab from a log of carrying a body, as a model of this log."""
-
-from __future__ import annotations
+"""Calibration of a carried body, or of the cameras that see it: a run of the log of carrying it."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -11,6 +9,7 @@ import numpy as np
 from ipsys_log.calibration.board import Board
 from ipsys_log.calibration.board_detection import BoardSighting, find_board
 from ipsys_log.calibration.images import read_frames
+from ipsys_log.calibration.joint.body_calibration import BodyCalibration, calibrate_body
 from ipsys_log.calibration.joint.carried_observations import BOARD, gather_board, gather_carried
 from ipsys_log.calibration.joint.fit import JointFit
 from ipsys_log.calibration.joint.hand_held import fit_hand_held, fit_motion
@@ -24,15 +23,20 @@ from ipsys_log.calibration.joint.lab_frame import (
     relative_length,
 )
 from ipsys_log.calibration.joint.observations import Observations
-from ipsys_log.calibration.joint.payload import JOINT, joint_payload
+from ipsys_log.calibration.joint.payload import JOINT, joint_payload, restore_joint
 from ipsys_log.calibration.joint.settings import JointSettings
-from ipsys_log.engine.provenance import fingerprint, free_name, newest_run, read_channels
+from ipsys_log.engine.mended_model import find_model
+from ipsys_log.engine.provenance import new_run, newest_run, read_channels
 from ipsys_log.errors import IpsysError
+from ipsys_log.log.contents import run_of_topic
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import IMPORTED, Array, CameraCalibration, Interval, Markers, Message, Rig, Run
-from ipsys_log.messages.channels import MARKERS, MEASUREMENTS, MODEL
+from ipsys_log.messages.channels import CALIBRATED_RIG, MARKERS, MEASUREMENTS, MODEL
+from ipsys_log.models.table import reads_corners
+from ipsys_log.sinks.selection import rig_in_force
 from ipsys_log.statistics.calibration_points import active_measurements
 from ipsys_log.statistics.joint_evaluation import is_nominal
+from ipsys_log.tools.cut_selection import CutOptions, time_range
 from ipsys_log.vision.bodies import body_shapes
 
 # Between a body that lies on the floor and its marker: paper and plates bend by half a millimetre.
@@ -103,9 +107,7 @@ def calibrate_carried_lab(
     IpsysError
         The log has no markers of the body, or the frames do not determine the cameras.
     """
-    run = newest_run(session, MARKERS)
-    if run is None:
-        raise IpsysError(f"{session}: has no markers; run: ipsys replay LOG --until detect")
+    run = _markers_run(session)
     topics = session.topics(MARKERS, run)
     markers: dict[str, list[Markers]] = {}
     for message in session.messages(topics):
@@ -130,7 +132,7 @@ def calibrate_carried_lab(
         f"marker {i} of {robot} has no pose in the rig: it is not used" for i in ids if i not in shape.markers
     ]
     lab = replace(lab, remarks=(*unknown, *left_out.values(), *lab.remarks))
-    return lab, *_record(session, lab, (run,), [*topics, *session.topics(MEASUREMENTS)])
+    return lab, *_store(session, lab, (run,), [*topics, *session.topics(MEASUREMENTS)])
 
 
 def calibrate_with_board(
@@ -139,13 +141,7 @@ def calibrate_with_board(
     lenses: Mapping[str, CameraCalibration],
     progress: Progress = lambda what, done, total: None,
 ) -> tuple[CarriedLab, Run, Message]:
-    """Estimate the same from a board in the frames of the log.
-
-    Raises
-    ------
-    IpsysError
-        The log has no frames, no camera sees the board, or the frames do not determine the cameras.
-    """
+    """Estimate the same from a board in the frames of the log."""
     if not session.images:
         raise IpsysError(f"{session}: has no frames of a board; record them, or use a body with --body")
     sightings, done = dict[str, list[tuple[int, BoardSighting]]](), 0
@@ -170,7 +166,14 @@ def calibrate_with_board(
         )
         fit = fit_motion(_fit(replace(observations, sightings=tables), fit.settings, progress))
     lab = _describe(str(board), fit, targets, rest, _BOARD_SCALE_SIGMA, progress)
-    return lab, *_record(session, lab, (), list(session.images.values()))
+    return lab, *_store(session, lab, (), list(session.images.values()))
+
+
+def _markers_run(session: Session) -> str:
+    run = newest_run(session, MARKERS)
+    if run is None:
+        raise IpsysError(f"{session}: has no markers; run: ipsys replay LOG --until detect")
+    return run
 
 
 def _find_contradiction(errors: Mapping[str, float]) -> tuple[str, float] | None:
@@ -265,20 +268,56 @@ def _remarks(frame: LabFrame, rest: Interval | None, camera: str | None) -> tupl
     )
 
 
-def _record(
+def _store(
     session: Session, lab: CarriedLab, runs: tuple[str, ...], topics: Sequence[str]
 ) -> tuple[Run, Message]:
-    log_time_ns, time_ns = session.last(topics)
+    parameters = {"format": "carried body", "body": lab.robot, "model": JOINT}
+    record = Run(0, "", IMPORTED, parameters, input_runs=runs, inputs=read_channels(session, topics))
+    record, log_time_ns = new_run(session, record, JOINT, topics)
+    model = joint_payload(lab.fit, {}, record.timestamp)
+    return record, Message(MODEL.topic_of(record.run), log_time_ns, record.timestamp, model)
+
+
+def calibrate_carried_body(
+    session: Session, robot: str, rig: Rig | None = None, start: str = "", end: str = ""
+) -> tuple[BodyCalibration, Run, Message]:
+    """Estimate the poses of the markers of a body; return them, and the run that stores them.
+
+    Parameters
+    ----------
+    session : the logs with the markers and the joint model.
+    robot : the body.
+    rig : names the markers of the body. None: the rig of the log.
+    start, end : a part of the log, as in :class:`ipsys_log.tools.cut_selection.CutOptions`.
+
+    Raises
+    ------
+    IpsysError
+        The log has no joint model, no markers or no such body, or the frames do not determine its poses.
+    """
+    start_ns, end_ns = time_range(session, CutOptions(start=start, end=end))
+    found = find_model(session, session.end_ns)
+    if found is None or not reads_corners(found[0].name):
+        raise IpsysError(
+            f"{session}: has no model joint, which knows the poses of the cameras; run: ipsys calibrate-lab, "
+            "and name its log before this one"
+        )
+    run = _markers_run(session)
+    rig = rig or rig_in_force(session, [run])
+    if rig is None:
+        raise IpsysError(f"{session}: has no rig, which names the markers of {robot}; give --rig lab.toml")
+    topics = session.topics(MARKERS, run)
+    messages = session.messages(topics, start_ns, end_ns)
+    body = calibrate_body(restore_joint(found[0]), rig, robot, messages)
+    parameters = {"format": "body", "robot": robot, "start": start, "end": end}
     record = Run(
-        time_ns,
+        0,
         "",
         IMPORTED,
-        {"format": "carried body", "body": lab.robot, "model": JOINT},
-        fingerprint(),
-        input_runs=runs,
-        inputs=read_channels(session, topics),
-        number=max((own.number for own in session.runs()), default=0) + 1,
+        {key: text for key, text in parameters.items() if text},
+        input_runs=tuple({run: "", str(run_of_topic(found[1])): ""}),
+        inputs=read_channels(session, [*topics, found[1]]),
     )
-    record = replace(record, run=free_name(session, record, JOINT, ()))
-    model = joint_payload(lab.fit, {}, time_ns)
-    return record, Message(MODEL.topic_of(record.run), log_time_ns, time_ns, model)
+    record, log_time_ns = new_run(session, record, f"{robot}_body", topics)
+    message = Message(CALIBRATED_RIG.topic_of(record.run), log_time_ns, record.timestamp, body.apply(rig))
+    return body, record, message

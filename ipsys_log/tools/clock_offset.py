@@ -112,10 +112,6 @@ def estimate_clock_offset(first: Iterable[MarkerPath], second: Iterable[MarkerPa
     ----------
     first, second : paths of markers in the images of the cameras of each recording.
 
-    Returns
-    -------
-    The offset with its standard deviation.
-
     Raises
     ------
     FitError
@@ -148,14 +144,7 @@ def estimate_clock_offset(first: Iterable[MarkerPath], second: Iterable[MarkerPa
 def _unique(pairs: Sequence[_Pair], fits: Sequence[_Fit]) -> tuple[float, float]:
     """Return the offset of the only fit that is sharp and good, and its standard deviation, in s.
 
-    Parameters
-    ----------
-    fits : in the order of their misfits.
-
-    Raises
-    ------
-    FitError
-        There is no such fit, or there are several.
+    The fits are in the order of their misfits.
     """
     best: tuple[_Fit, float] | None = None
     blurred: list[_Fit] = []  # fits with a small misfit and a large sigma

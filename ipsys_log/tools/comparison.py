@@ -31,9 +31,7 @@ from ipsys_log.vision.poses import make_pose, rotation, rotation_vector
 _MARGIN_NS = NS_PER_S
 _LONGEST_NAME = 40
 # Parameters that are no numbers.
-_TEXTS = {
-    *("format", "file", "file_sha256", "body", "robot", "align", "axes", "remarks", "with_scale"),
-}
+_TEXTS = {*("format", "file", "file_sha256", "body", "robot", "align", "axes", "remarks", "with_scale")}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -201,9 +199,8 @@ def append_comparisons(
 def read_comparisons(session: Session, run: str | None = None) -> list[Comparison]:
     """Return the comparisons that a log stores, computed again from their poses and the tracks.
 
-    Parameters
-    ----------
-    run : the run with the tracks; None: those of each comparison, or the newest ones if the log lacks them.
+    ``run`` is the run with the tracks; None: those of each comparison, or the newest ones if the log lacks
+    them.
     """
     found, tracked = [], dict[str | None, TrackedRobots]()
     for record in session.runs():

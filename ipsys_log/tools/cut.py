@@ -54,10 +54,6 @@ def cut(
     The new log gets its name when it is complete. It has the attachments and metadata of the logs, and the
     record of the cut as its last message.
 
-    Parameters
-    ----------
-    overwrite : replace an existing log.
-
     Raises
     ------
     IpsysError
@@ -266,13 +262,7 @@ class DroppedRun:
 
 
 def dropped_runs(path: LogLocation) -> list[DroppedRun]:
-    """Return the runs that a compaction of a log drops, by name; only their chunks are read.
-
-    Raises
-    ------
-    LogError
-        The log is damaged.
-    """
+    """Return the runs that a compaction of a log drops, by name; only their chunks are read."""
     with Session([path]) as session:
         runs = superseded_runs(session)
         (reader,) = session.readers
@@ -303,10 +293,6 @@ def compact(
 
     The copy gets its name when it is complete. Each kept channel has the same messages, so the records of the
     kept runs are true for the copy, too.
-
-    Parameters
-    ----------
-    overwrite : replace an existing log.
 
     Raises
     ------

@@ -16,6 +16,7 @@ from ipsys_log.log.contents import camera_of_topic, run_of_topic
 from ipsys_log.log.dataset import Session
 from ipsys_log.messages import CompressedVideo, Times
 from ipsys_log.messages.channels import CAMERA_POINTS, CHANNELS, CUTS, MARKERS, MERGES, POSITIONS, RECORD, RIG
+from ipsys_log.plain_text import join_names
 from ipsys_log.tools.differences import marker_ids
 from ipsys_log.units import NS_PER_S, format_time
 from ipsys_log.vision.video import is_keyframe
@@ -283,9 +284,7 @@ def _check_known(session: Session, kind: str, names: Iterable[str], known: Colle
 
 
 def _listed(names: Sequence[str]) -> str:
-    more = len(names) - _MOST_NAMES
-    text = ", ".join(names[:_MOST_NAMES]) or "none"
-    return text if more <= 0 else f"{text} and {more} more"
+    return join_names(names, _MOST_NAMES) or "none"
 
 
 def time_range(session: Session, options: CutOptions) -> tuple[int, int]:

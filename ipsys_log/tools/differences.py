@@ -53,9 +53,7 @@ class Extent:
 def explain_no_overlap(first: Extent, second: Extent) -> str | None:
     """Return the reason why two sides have nothing in common; None if they have common data.
 
-    Parameters
-    ----------
-    first, second : extents of the markers, points, positions or tracks of both sides.
+    The extents are those of the markers, points, positions or tracks of both sides.
     """
     if not (len(first.times_ns) and len(second.times_ns)):
         side = "second" if len(first.times_ns) else "first"

@@ -105,13 +105,7 @@ def read_estimates(
     say: Callable[[str], None],
     progress: Progress,
 ) -> list[Body]:
-    """Return the bodies to compare: the selected ones of a file, else those named as robots, else all.
-
-    Raises
-    ------
-    IpsysError
-        A file cannot be read, or a robot or a body of the options is not known.
-    """
+    """Return the bodies to compare: the selected ones of a file, else those named as robots, else all."""
     selected = (options.topic,) if options.topic else selected_bodies(options.robots)
     wanted = Wanted(selected, options.units)
     for file in files:

@@ -33,9 +33,7 @@ _LARGEST_S = 1_000_000_000
 
 @one_reading()
 def choose_offsets(
-    paths: Sequence[LogLocation],
-    texts: Sequence[str],
-    progress: Progress = lambda stage, done, total: None,
+    paths: Sequence[LogLocation], texts: Sequence[str], progress: Progress = lambda stage, done, total: None
 ) -> list[LogOffset]:
     """Return the offset of each log: of an option ``NAME=SECONDS``, or estimated; 0 for the first log.
 
@@ -69,13 +67,7 @@ def choose_offsets(
 
 
 def _estimate(session: Session, earlier: Sequence[MarkerPath], own: Sequence[MarkerPath]) -> LogOffset:
-    """Estimate the offset of a log from the paths of its markers and those of earlier logs.
-
-    Raises
-    ------
-    IpsysError
-        The offset cannot be estimated.
-    """
+    """Estimate the offset of a log from the paths of its markers and those of earlier logs."""
     option = f"--offset {session.paths[0].stem}=SECONDS"
     try:
         estimate = estimate_clock_offset(earlier, own)
@@ -89,13 +81,7 @@ def _estimate(session: Session, earlier: Sequence[MarkerPath], own: Sequence[Mar
 
 
 def _marker_paths(session: Session, zero_ns: int) -> list[MarkerPath]:
-    """Return the paths of the markers in the images of each camera, by the newest run with markers.
-
-    Raises
-    ------
-    IpsysError
-        The log has no markers.
-    """
+    """Return the paths of the markers in the images of each camera, by the newest run with markers."""
     run = newest_run(session, MARKERS)
     if run is None:
         raise IpsysError(
@@ -207,13 +193,7 @@ def merge(
 
 
 def open_logs(paths: Sequence[LogLocation], stack: ExitStack) -> list[Session]:
-    """Open several logs that differ, each in its own session.
-
-    Raises
-    ------
-    IpsysError
-        There are fewer than two logs, one is named twice, or one has no messages.
-    """
+    """Open several logs that differ, each in its own session."""
     if len(paths) < 2:
         raise IpsysError("a merge needs two logs or more; name the log of each recorder")
     sessions = []

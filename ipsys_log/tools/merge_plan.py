@@ -50,13 +50,7 @@ class MergePlan:
 
 
 def check_logs_differ(sessions: Sequence[Session]) -> None:
-    """Refuse logs with images or results of the same camera, or with measurements of the same id.
-
-    Raises
-    ------
-    IpsysError
-        The text names the camera, or the id, and both logs.
-    """
+    """Refuse logs with images or results of the same camera, or with measurements of the same id."""
     owners: dict[str, Session] = {}
     for session in sessions:
         for camera in sorted(_cameras(session)):
@@ -127,13 +121,7 @@ def _source(session: Session, number: int, offset_ns: int, common: _Common) -> M
 
 
 def _plan_rig(sessions: Sequence[Session], common: _Common) -> None:
-    """Note the combined rig if it is not that of its owner, and the equal topics of later logs.
-
-    Raises
-    ------
-    IpsysError
-        The rigs contradict each other, or a rig changes during its log.
-    """
+    """Note the combined rig if it is not that of its owner, and the equal topics of later logs."""
     topics = [session.topics(RIG) for session in sessions]
     with_rig = [number for number, names in enumerate(topics) if names]
     if len(with_rig) < 2:
@@ -158,13 +146,7 @@ def _only_rig(session: Session, topics: Sequence[str]) -> Rig:
 
 
 def _plan_intrinsics(sessions: Sequence[Session], common: _Common) -> None:
-    """Note the equal intrinsics of later logs.
-
-    Raises
-    ------
-    IpsysError
-        Two logs have different intrinsics of one camera.
-    """
+    """Note the equal intrinsics of later logs."""
     owners: dict[str, Session] = {}
     for session, equal in zip(sessions, common.equal, strict=True):
         for camera, topic in session.calibrations.items():
@@ -182,13 +164,7 @@ def _plan_intrinsics(sessions: Sequence[Session], common: _Common) -> None:
 
 
 def _plan_same_channels(sessions: Sequence[Session], common: _Common) -> None:
-    """Note the channels of later logs whose messages are those of an earlier log.
-
-    Raises
-    ------
-    IpsysError
-        Two logs have different results of one run.
-    """
+    """Note the channels of later logs whose messages are those of an earlier log."""
     owners: dict[str, Session] = {}
     for session, equal in zip(sessions, common.equal, strict=True):
         for topic in sorted(session.readers[0].channels.keys() - {*equal, CUTS.topic, MERGES.topic}):

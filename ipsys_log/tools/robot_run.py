@@ -106,13 +106,7 @@ def has_robot_run(session: Session) -> bool:
 
 
 def read_robot_run(session: Session) -> RobotRunResult:
-    """Return the results of a robot run.
-
-    Raises
-    ------
-    IpsysError
-        The log has no commands of robots.
-    """
+    """Return the results of a robot run."""
     paths: list[RobotPath] = session.payloads(session.topics(PATHS))
     commands: list[WheelCommand] = session.payloads(session.topics(COMMANDS))
     if not paths or not commands:

@@ -113,13 +113,7 @@ def verify(
 def _is_repeated(
     session: Session, stage: Recorded, checked: Collection[str], say: Callable[[str], None]
 ) -> bool:
-    """Return whether a stage is repeated; print the reason if not.
-
-    Raises
-    ------
-    IpsysError
-        Its inputs have changed.
-    """
+    """Return whether a stage is repeated; print the reason if not."""
     run = stage.run
     if logs := copied_from(session, run):
         say(f"run {run.run}: {run.stage} was copied from {', '.join(logs)}; its hashes are compared")
@@ -195,11 +189,6 @@ def diff(left: LogLocation, right: LogLocation, runs: tuple[str | None, str | No
     Parameters
     ----------
     runs : of the left and of the right log; None: all common runs.
-
-    Raises
-    ------
-    IpsysError
-        A run does not exist, or the logs have no run in common.
     """
     with Session([left]) as left_session, Session([right]) as right_session:
         first, second = _compared_runs(left_session, right_session, runs)

@@ -4,8 +4,6 @@ Axes of a marker: x to the top of its print (the direction of its heading), y to
 has those of its first marker, if this one has no pose of its own.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from math import atan2, hypot
 

@@ -65,13 +65,7 @@ def check_encoded(data: bytes) -> None:
 
 
 def check_pixel_count(width: int, height: int, jpeg_bytes: int | None = None) -> None:
-    """Check that a size in px is not too large, also for the number of bytes of a JPEG.
-
-    Raises
-    ------
-    FrameError
-        The size is too large, see :func:`check_encoded`.
-    """
+    """Check that a size in px is not too large, also for the number of bytes of a JPEG."""
     if width * height > MAX_PIXELS:
         raise FrameError(f"a picture of {width} x {height} px, more than {MAX_PIXELS} in all")
     if jpeg_bytes is not None and width * height > _JPEG_PIXELS_PER_BYTE * jpeg_bytes:
@@ -141,11 +135,6 @@ def decode_rows(
     -------
     The image (height, width), valid until this thread decodes the next image, and its decoded rows. All other
     rows are black.
-
-    Raises
-    ------
-    FrameError
-        The data is damaged.
     """
     layout = read_layout(frame.data) if isinstance(frame, CompressedImage) else None
     if layout is None:
@@ -272,14 +261,7 @@ def _raw_pixels(frame: RawImage) -> NDArray[np.uint8]:
 def decode_colour(frame: CompressedImage | RawImage, least_px: tuple[int, int] = (0, 0)) -> NDArray[np.uint8]:
     """Decode the colours of a frame for a drawing, (height, width, 3), in the order BGR.
 
-    Parameters
-    ----------
-    least_px : width and height that suffice; a JPEG may then be decoded at a part of its size.
-
-    Raises
-    ------
-    FrameError
-        The data is no image.
+    ``least_px`` is a size that suffices; a JPEG may then be decoded at a part of its size.
     """
     if isinstance(frame, RawImage):
         pixels, conversion = np.ascontiguousarray(_raw_pixels(frame)), _RAW[frame.encoding][2]

@@ -125,11 +125,6 @@ def cut_rows(
     Returns
     -------
     A JPEG for each slice. Without restart markers, it ends with data that no row needs.
-
-    Raises
-    ------
-    FrameError
-        Restart markers are missing or out of order.
     """
     pieces: list[bytearray | memoryview]
     if layout.interval or not rows:
@@ -152,13 +147,7 @@ def _find_restarts(codes: NDArray[np.uint8], layout: JpegHeader) -> NDArray[np.i
 
 
 def check_restarts(codes: NDArray[np.uint8], layout: JpegHeader) -> None:
-    """Check that all restart markers are present and in order, because their count identifies rows.
-
-    Raises
-    ------
-    FrameError
-        Restart markers are missing or out of order.
-    """
+    """Check that all restart markers are present and in order, because their count identifies rows."""
     blocks = layout.blocks * -(-layout.height // layout.block_px)
     wanted = _RESTART + np.arange(-(-blocks // (layout.interval or blocks)) - 1) % _CYCLE
     if not np.array_equal(codes, wanted):
@@ -223,9 +212,7 @@ def remove_stray_bytes(data: bytes) -> bytes:
 def decode_flawed(data: bytes) -> NDArray[np.uint8] | None:
     """Return the grey image (height, width) of a baseline JPEG whose flaws lose no pixel; None after a loss.
 
-    Parameters
-    ----------
-    data : a JPEG of which a decoder warns, after :func:`remove_stray_bytes`.
+    ``data`` is a JPEG of which a decoder warns, after :func:`remove_stray_bytes`.
     """
     header = read_header(data)
     if header is None:
@@ -272,13 +259,7 @@ class _Pieces:
 
 
 def _split(coded: bytes, header: JpegHeader) -> list[bytes]:
-    """Return the coded data between restart markers, with little filler (zeros or 0xff) at their ends.
-
-    Raises
-    ------
-    FrameError
-        Restart markers are missing or out of order.
-    """
+    """Return the coded data between restart markers, with little filler (zeros or 0xff) at their ends."""
     end = coded.find(_END)
     coded = coded if end < 0 else coded[:end]
     check_restarts(np.frombuffer(b"".join(_RESTARTS.findall(coded)), np.uint8), header)

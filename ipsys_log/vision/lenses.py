@@ -99,13 +99,7 @@ def _advice(lens: CameraCalibration) -> str:
 
 
 def check_size(lens: CameraCalibration, width: int, height: int, camera: str | None) -> None:
-    """Check that a calibration has the size of the frames of a camera.
-
-    Raises
-    ------
-    SizeError
-        The calibration is for another size.
-    """
+    """Check that a calibration has the size of the frames of a camera."""
     if (lens.width, lens.height) != (width, height):
         raise SizeError(
             f"camera {camera}: its frames are {width} x {height} px, its calibration is for "
@@ -116,11 +110,6 @@ def check_size(lens: CameraCalibration, width: int, height: int, camera: str | N
 
 def scale_intrinsics(lens: CameraCalibration, width: int, height: int, where: str) -> CameraCalibration:
     """Return the calibration for images of another size with the same field of view.
-
-    Raises
-    ------
-    IpsysError
-        The new size has another aspect ratio, so its field of view differs. The text names ``where``.
 
     Examples
     --------

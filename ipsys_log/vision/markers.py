@@ -22,13 +22,7 @@ _NO_VARIANCE = 1e-4
 
 
 def check_covariance(covariance_px2: Array, where: str) -> None:
-    """Check that a covariance, of any rank, is usable in computations.
-
-    Raises
-    ------
-    IpsysError
-        The matrix is not a covariance. The text names ``where``.
-    """
+    """Check that a covariance, of any rank, is usable in computations."""
     if not (np.isfinite(covariance_px2).all() and covariance_px2.trace() > 0):
         raise IpsysError(f"{where}: covariance_px2 has no variance; detect the markers again")
 
@@ -198,9 +192,7 @@ def marker_corners(length_m: float) -> Array:
 def white_cells(dictionary: str, marker_id: int) -> NDArray[np.bool_]:
     """Return a mask of the white cells of a marker, (n, n) with its black border, the top row first.
 
-    Parameters
-    ----------
-    dictionary : OpenCV's name, such as DICT_4X4_100.
+    The dictionary has OpenCV's name, such as DICT_4X4_100.
     """
     known = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
     image = cv2.aruco.generateImageMarker(known, marker_id, known.markerSize + 2, borderBits=1)
@@ -268,12 +260,6 @@ def print_outline(placed: PlacedMarker | PlacedBoard, dictionary: str) -> Array:
 
 def project_corners(lens: CameraCalibration, camera_from_world: Array, placed: PlacedMarker) -> Array:
     """Return the exact pixels of the corners of the black square, without noise, in OpenCV's order.
-
-    Parameters
-    ----------
-    lens : intrinsics of the camera.
-    camera_from_world : (4, 4), pose of the camera.
-    placed : the marker.
 
     Returns
     -------

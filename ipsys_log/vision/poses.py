@@ -175,11 +175,11 @@ def cross(first: Array, second: Array) -> Array:
 
 
 def skew_matrices(vectors: Array) -> Array:
-    """Return the matrices (n, 3, 3) of the cross product with each vector (n, 3)."""
-    skew = np.zeros((len(vectors), 3, 3))
-    x, y, z = vectors.T
-    skew[:, 0, 1], skew[:, 0, 2], skew[:, 1, 2] = -z, y, -x
-    skew[:, 1, 0], skew[:, 2, 0], skew[:, 2, 1] = z, -y, x
+    """Return the matrices (..., 3, 3) of the cross product with vectors (..., 3)."""
+    skew = np.zeros((*vectors.shape, 3))
+    x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
+    skew[..., 0, 1], skew[..., 0, 2], skew[..., 1, 2] = -z, y, -x
+    skew[..., 1, 0], skew[..., 2, 0], skew[..., 2, 1] = z, -y, x
     return skew
 
 

@@ -136,10 +136,6 @@ def fit_squares(uv: Array, whitening: Array, lengths_m: Array) -> SquarePoses:
         :func:`ipsys_log.vision.markers.whiten`, times the slopes of the lens).
     lengths_m : (n,), sides of the black squares, in m.
 
-    Returns
-    -------
-    SquarePoses.
-
     References
     ----------
     Collins and Bartoli, Infinitesimal plane-based pose estimation, IJCV 2014, for the two solutions.

@@ -223,13 +223,7 @@ def is_keyframe(frame: CompressedVideo) -> bool:
 
 
 def decode_keyframe(frame: CompressedVideo) -> RawImage:
-    """Return the grey image of a keyframe.
-
-    Raises
-    ------
-    FrameError
-        The frame is damaged, or it is not a keyframe.
-    """
+    """Return the grey image of a keyframe."""
     image = Video(frame.format)(frame)
     if image is None:
         raise FrameError(f"{len(frame.data)} bytes of {frame.format} that are no keyframe")
@@ -237,13 +231,7 @@ def decode_keyframe(frame: CompressedVideo) -> RawImage:
 
 
 def decode_alone(frame: CompressedImage | CompressedVideo | RawImage) -> Grey:
-    """Return the grey levels of an image or a keyframe, without other frames.
-
-    Raises
-    ------
-    FrameError
-        The frame is damaged, or it is of a video and no keyframe.
-    """
+    """Return the grey levels of an image or a keyframe, without other frames."""
     return decode_grey(decode_keyframe(frame) if isinstance(frame, CompressedVideo) else frame)
 
 
@@ -253,11 +241,6 @@ def decode_last(backwards: Iterable[CompressedVideo]) -> RawImage | None:
     Parameters
     ----------
     backwards : this frame, the previous frame, and so on. They are read up to the first keyframe.
-
-    Raises
-    ------
-    FrameError
-        The frame, or a frame that it needs, is damaged.
     """
     needed: list[CompressedVideo] = []
     for frame in backwards:

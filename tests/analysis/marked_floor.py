@@ -1,7 +1,5 @@
 """Markers on the floor below a camera, as a camera with other intrinsics sees them; without images."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

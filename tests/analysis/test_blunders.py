@@ -1,7 +1,5 @@
 """The effect of each gross error on a calibration point, as text and as a corrected measurement."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

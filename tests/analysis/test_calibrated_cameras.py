@@ -1,7 +1,5 @@
 """Cameras of a joint calibration, as the figures show them: poses, fields of view, clocks and residuals."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Clock offsets of recorders, from markers that both saw moving in a lab without images."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 
@@ -61,8 +59,7 @@ def test_markers_that_stand_in_one_recording_give_no_offset() -> None:
 
 
 @pytest.mark.parametrize(
-    ("seed", "drive_s", "is_lab"),
-    [(0, 12.0, False), pytest.param(0, 20.0, True, marks=pytest.mark.slow)],
+    ("seed", "drive_s", "is_lab"), [(0, 12.0, False), pytest.param(0, 20.0, True, marks=pytest.mark.slow)]
 )
 def test_paths_of_another_session_do_not_agree(seed: int, drive_s: float, is_lab: bool) -> None:
     """The same ids move in both recordings, but on other paths."""

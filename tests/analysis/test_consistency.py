@@ -1,7 +1,5 @@
 """Estimates of the usual errors, from errors with a known distribution."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

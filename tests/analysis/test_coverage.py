@@ -1,7 +1,5 @@
 """The coverage of the floor, compared with a closed form and with every marker corner."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """Scores of a robot's estimate by closed forms: coverage, drift, NEES and the part of the tracks."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """The error over the floor, compared with brute force, closed forms and the stages."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -71,10 +69,7 @@ def displaced(
     truth_m = {seen.camera: seen.truth_m for seen in nodes}
 
     def locate(
-        camera: str,
-        corners_px: Array,
-        heights_m: Array,
-        covariances_px2: Array | None = None,
+        camera: str, corners_px: Array, heights_m: Array, covariances_px2: Array | None = None
     ) -> tuple[Array, Array | None]:
         assert corners_px.shape == (len(truth_m[camera]), 4, 2)
         positions_m = np.column_stack([truth_m[camera] + errors_m[camera], heights_m])

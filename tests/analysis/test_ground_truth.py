@@ -1,7 +1,5 @@
 """Errors of tracks against the ground truth, at its times and between them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

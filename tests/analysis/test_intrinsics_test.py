@@ -1,7 +1,5 @@
 """The test of camera intrinsics by the markers in the images, against markers through other intrinsics."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

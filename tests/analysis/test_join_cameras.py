@@ -1,7 +1,5 @@
 """Cameras joined without a tape, compared with their true poses."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

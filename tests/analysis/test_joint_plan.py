@@ -1,7 +1,5 @@
 """Plans for a joint calibration: the effect of points and drives, against other ways to compute it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Clocks of nodes: offset and drift from exchanges with known delays."""
 
-from __future__ import annotations
-
 import random
 
 import numpy as np

@@ -240,9 +240,7 @@ def test_a_wrong_side_next_to_the_line_cannot_be_seen() -> None:
     session = simulated(5)
     name = next(n for n, point in session.truth.items() if n in session.points["white"])
     beside = replace(
-        session.measurement(name),
-        distances=(Distance("A", 1.2), Distance("B", 1.2386)),
-        side="right",
+        session.measurement(name), distances=(Distance("A", 1.2), Distance("B", 1.2386)), side="right"
     )
     here = world_point(beside, RIG).world_m
     across = abs(here[1] - A.y_m)

@@ -1,7 +1,5 @@
 """The valid calibration points, their positions, and their observations by a camera."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Clock, frames and pivot between tracks and another system, from drives in closed form with known truth."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from decimal import Decimal

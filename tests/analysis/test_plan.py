@@ -1,7 +1,5 @@
 """The plan of points to measure, compared with ground truth and with other computations."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import cv2

@@ -1,7 +1,5 @@
 """The state of live positions, from given stamps: live, late or stale, with the cause."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The mean error after the stated error of the tape: its interval covers the truth."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Intervals of a stationary marker and of a slowly moving marker."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -4,8 +4,6 @@ It is a separate process, so that no thread or socket of Dask stays in the proce
 is JSON; it prints the results as JSON, or the error.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 from dataclasses import asdict

@@ -3,8 +3,6 @@
 Each worker that gets a task of this work imports this module. The environment names the folder for notes.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import time

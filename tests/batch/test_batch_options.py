@@ -1,7 +1,5 @@
 """The options of a batch: settings, paths, names of files, and the number of workers."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Long logs in batches with real workers: the bytes of one process, and killed workers during a piece."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Batches and catalogues of logs in an S3 server on loopback: derived logs, pieces, and changed objects."""
 
-from __future__ import annotations
-
 import json
 import os
 import pickle

@@ -1,7 +1,5 @@
 """Batches with real workers: the bytes of the single command, killed workers, a full disk, a scheduler."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

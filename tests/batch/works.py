@@ -1,7 +1,5 @@
 """Works for the tests of batches: they end their worker, wait, or fill a disk. Workers import this module."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """Calibration boards in images, by independent formulas: noisy corners and rendered images."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import cv2

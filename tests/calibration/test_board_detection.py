@@ -1,7 +1,5 @@
 """Corners and sharpness in rendered images with ground truth, and the selection of images."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cache
 

@@ -1,7 +1,5 @@
 """The size of a board: the user's size counts, unless most images show another size."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The advice on a calibration that could be better."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Images for a calibration of intrinsics, from logs, folders, files and videos."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from pathlib import Path

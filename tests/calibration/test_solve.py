@@ -1,7 +1,5 @@
 """Known intrinsics estimated from noisy corners, and their errors compared with the standard deviations."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import cv2

@@ -1,7 +1,5 @@
 """Images of two cameras in one folder are separated; those of one camera are not."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

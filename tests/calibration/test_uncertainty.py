@@ -1,7 +1,5 @@
 """Uncertainties with few images, and of lenses outside the fitted model, compared with the ground truth."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

@@ -4,8 +4,6 @@ It answers the requests of ``ioctl`` on an open file according to the documentat
 is real, so that its buffers are mapped like those of a device.
 """
 
-from __future__ import annotations
-
 import errno
 import time
 from collections import deque

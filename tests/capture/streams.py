@@ -1,7 +1,5 @@
 """Real streams on loopback: FFmpeg serves them, and an RTSP server forwards FFmpeg's RTP packets."""
 
-from __future__ import annotations
-
 import shutil
 import socket
 import socketserver

@@ -1,7 +1,5 @@
 """Frames that wait for the stages: their number is bounded, and each searched frame can be decoded."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from hypothesis import given

@@ -1,7 +1,5 @@
 """The size of a recording, and the time until the disk is full, before and during a recording."""
 
-from __future__ import annotations
-
 import math
 import re
 import shutil

@@ -1,7 +1,5 @@
 """Live cameras: the order of their messages, lost frames, and events."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Cameras on the network, as real streams on loopback."""
 
-from __future__ import annotations
-
 import http.server
 import re
 import socket

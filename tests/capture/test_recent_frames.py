@@ -1,7 +1,5 @@
 """Only frames of measured points go into the log: about one second per point."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Generator, Iterator
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Frames are logged before their results, and waiting frames are bounded."""
 
-from __future__ import annotations
-
 import errno
 import threading
 from collections.abc import Generator, Iterator
@@ -208,9 +206,7 @@ class FullDisk(Storage):
         return Storage.pwrite(self, fd, data, offset)
 
 
-def test_full_disk_drops_frames_and_writes_other_messages(
-    tmp_path: Path,
-) -> None:
+def test_full_disk_drops_frames_and_writes_other_messages(tmp_path: Path) -> None:
     disk, path = FullDisk(), tmp_path / "a.mcap"
 
     def source() -> Generator[Message | None, None, None]:

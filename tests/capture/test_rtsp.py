@@ -1,7 +1,5 @@
 """Cameras by RTSP from the server of GStreamer, as independent software."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """The simulated lab in real time."""
 
-from __future__ import annotations
-
 import math
 import threading
 from itertools import islice, pairwise

@@ -1,7 +1,5 @@
 """A suspended recorder reports the frames with wrong times."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager

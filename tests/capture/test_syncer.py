@@ -1,7 +1,5 @@
 """Recorded data reaches the disk every few seconds. Only a measured point waits for that."""
 
-from __future__ import annotations
-
 import errno
 import threading
 from collections.abc import Generator

@@ -1,7 +1,5 @@
 """Cameras on USB: no camera is needed, :mod:`tests.capture.camera_driver` answers for the kernel."""
 
-from __future__ import annotations
-
 import errno
 import sys
 from itertools import islice

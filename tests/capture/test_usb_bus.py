@@ -1,7 +1,5 @@
 """The attached cameras and the load of their USB bus, read from a simulated sysfs."""
 
-from __future__ import annotations
-
 import json
 import struct
 import sys

@@ -1,7 +1,5 @@
 """Videos and images with times, as frames of a log and as live cameras."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The catalogue of a folder: its rows by another way, its updates, and its readers."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """``ipsys calibrate-body`` on the command line."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

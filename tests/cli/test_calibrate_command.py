@@ -1,7 +1,5 @@
 """``ipsys calibrate`` on rendered images of a known lens, and on real images."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,7 +1,5 @@
 """``ipsys calibrate-lab`` on the command line, in simulated labs without images."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Iterator

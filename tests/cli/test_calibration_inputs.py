@@ -1,7 +1,5 @@
 """Commands that take calibration files: assumed lens models, and files that only the rig names."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

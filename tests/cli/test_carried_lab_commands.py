@@ -1,7 +1,5 @@
 """``ipsys calibrate-lab --body`` and ``--board``: cameras on walls, and four webcams."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

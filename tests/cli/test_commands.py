@@ -1,7 +1,5 @@
 """The commands on the command line."""
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess
@@ -189,12 +187,7 @@ CAMERAS = ("red", "white", "black")
 
 def test_runs_list_their_inputs(ipsys: Ipsys, replayed_lab: Path) -> None:
     runs = {run["stage"]: run for run in json.loads(ipsys("runs", replayed_lab, "--json").out)["rows"]}
-    assert runs["detect"]["parameters"] == {
-        "corners": "edges",
-        "reset_s": "30",
-        "detect": "3",
-        "edges": "3",
-    }
+    assert runs["detect"]["parameters"] == {"corners": "edges", "reset_s": "30", "detect": "3", "edges": "3"}
     assert {row["topic"] for row in runs["detect"]["inputs"]} == {
         "/rig",
         *(f"/cameras/{camera}/{what}" for camera in CAMERAS for what in ("image", "calibration")),

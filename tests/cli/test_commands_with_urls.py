@@ -1,7 +1,5 @@
 """Each command with a URL: it reads the log there, or refuses the URL in one line and writes nothing."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Iterator
 from pathlib import Path

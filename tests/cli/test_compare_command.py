@@ -1,7 +1,5 @@
 """``ipsys compare``: the odometry of a robot, by a closed form, scored against its tracks."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from dataclasses import replace

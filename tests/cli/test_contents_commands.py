@@ -1,7 +1,5 @@
 """The commands du and cat: all messages of a log as lines and as JSON, and their sizes."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

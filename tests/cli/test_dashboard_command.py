@@ -1,7 +1,5 @@
 """``ipsys live --web``: its addresses, its refusals, and its events in the log."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,7 +1,5 @@
 """Wrong input of ``ipsys drive`` gives one line: the fault, its place, and the remedy."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """The first day of a user: mistakes are reported at once, and names, pictures and help are clear."""
 
-from __future__ import annotations
-
 import json
 import shlex
 from pathlib import Path

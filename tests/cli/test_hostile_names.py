@@ -1,7 +1,5 @@
 """Names in a log are untrusted: terminals, tables and pages do not obey their contents."""
 
-from __future__ import annotations
-
 import os
 import pty
 import subprocess

@@ -1,7 +1,5 @@
 """``ipsys merge`` without options: the offset of two clocks from the markers of both logs."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import replace
@@ -86,10 +84,7 @@ def _without(path: Path, output: Path, keep: Callable[[Message], bool]) -> Path:
     ("keep", "text"),
     [
         (lambda m: not isinstance(m.payload, Markers) and not _is_record(m), "has no markers, so its clock"),
-        (
-            lambda m: not isinstance(m.payload, Markers) or all(one.id != 0 for one in m.payload.markers),
-            None,
-        ),
+        (lambda m: not isinstance(m.payload, Markers) or all(one.id != 0 for one in m.payload.markers), None),
     ],
     ids=["no_markers", "other_markers"],
 )

@@ -1,7 +1,5 @@
 """Mistakes of the first day: the message names the fault and the next step, and nothing is half-written."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """``ipsys node``: frames in both logs, and clear errors."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

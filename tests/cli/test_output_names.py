@@ -1,7 +1,5 @@
 """Names that -o refuses before any work is done and before any camera is opened."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """The progress of a command in a pipe: lines for the steps, and for the tenths of long steps."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Signals at any time of a command: exit codes, remaining files, and signals that stay ignored."""
 
-from __future__ import annotations
-
 import compileall
 import os
 import signal

@@ -1,7 +1,5 @@
 """All commands on the simulated lab, compared with its ground truth."""
 
-from __future__ import annotations
-
 import csv
 import json
 import subprocess

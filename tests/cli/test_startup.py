@@ -1,7 +1,5 @@
 """Libraries that take long to import are imported only by the commands that need them."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """``ipsys stream`` and the streams of ``ipsys live``: sockets, keys of the terminal, and refusals."""
 
-from __future__ import annotations
-
 import json
 import os
 import pty

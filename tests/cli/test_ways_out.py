@@ -1,7 +1,5 @@
 """Wrong or interrupted commands name the next step and the kept data."""
 
-from __future__ import annotations
-
 import json
 import os
 import pty

@@ -1,7 +1,5 @@
 """The motion of a robot with two wheels, against closed forms."""
 
-from __future__ import annotations
-
 from math import exp, hypot, pi, remainder
 
 import numpy as np

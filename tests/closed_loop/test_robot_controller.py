@@ -1,7 +1,5 @@
 """The example controller: it reaches its waypoints with delay and loss, and stops without positions."""
 
-from __future__ import annotations
-
 import socket
 from collections import deque
 from math import hypot

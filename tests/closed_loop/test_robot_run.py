@@ -1,7 +1,5 @@
 """Robot runs in simulated time: waypoints, lost datagrams, a failing camera, and equal bytes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import combinations

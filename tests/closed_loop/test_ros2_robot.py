@@ -1,7 +1,5 @@
 """The example robot with ROS 2: its decoder, and the relay that loses and delays its poses."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from math import remainder, tau

@@ -1,7 +1,5 @@
 """The simulated wheels refuse other robots and ignore invalid commands; the relay loses and delays."""
 
-from __future__ import annotations
-
 import json
 import socket
 from collections.abc import Iterator

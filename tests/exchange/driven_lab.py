@@ -1,7 +1,5 @@
 """Logs with a rig and smooth tracks of two robots, and files of another system with the same paths."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """A small log with known values: pictures of one camera, markers in them, and tracks of robots."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path

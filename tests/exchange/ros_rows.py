@@ -1,7 +1,5 @@
 """Bags of ROS 1 and ROS 2, written by rosbags from rows of topic, stamp, type and fields."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Small bags that unpack to much data are refused before they fill the memory or the disk."""
 
-from __future__ import annotations
-
 import tracemalloc
 import zlib
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Calibration files of other programs, with files that OpenCV writes as oracle."""
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Written calibrations that other software reads."""
 
-from __future__ import annotations
-
 import copy
 import tempfile
 from collections.abc import Callable

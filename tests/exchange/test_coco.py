@@ -1,7 +1,5 @@
 """A COCO data set has the pictures of the log, and the corners of their markers."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Exported files hold the values of the log, as other programs read them."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

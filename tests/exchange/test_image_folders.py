@@ -1,7 +1,5 @@
 """Import of image folders."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

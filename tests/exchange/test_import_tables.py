@@ -1,7 +1,5 @@
 """Tables of detections and calibration points come into a log with all stored digits."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

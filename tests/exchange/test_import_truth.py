@@ -1,7 +1,5 @@
 """Ground truth of another system comes into the clock and the coordinates of the lab."""
 
-from __future__ import annotations
-
 import re
 import shutil
 from pathlib import Path

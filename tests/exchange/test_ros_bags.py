@@ -1,7 +1,5 @@
 """Bags of ROS 1 and ROS 2 become logs with the same images, stamps and intrinsics."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

@@ -4,8 +4,6 @@ The corners below are what the AprilTag library returns for :func:`picture`: rel
 and commit 1c21707 for tagAruco4x4_50, with quad_decimate 2 and refine_edges. Release 3.1.7 is within 0.06 px.
 """
 
-from __future__ import annotations
-
 import shutil
 import sqlite3
 from collections.abc import Callable, Sequence

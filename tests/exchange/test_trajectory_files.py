@@ -1,7 +1,5 @@
 """Files of other systems as trajectories: layouts with one known pose, and the errors of wrong files."""
 
-from __future__ import annotations
-
 import os
 import struct
 from functools import partial

@@ -1,7 +1,5 @@
 """The cameras that a lab can use: their names and pictures, and typed addresses."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path

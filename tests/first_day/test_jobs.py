@@ -1,7 +1,5 @@
 """Jobs of the page: one at a time, with their errors, and a stop in order."""
 
-from __future__ import annotations
-
 import threading
 from pathlib import Path
 

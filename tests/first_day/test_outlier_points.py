@@ -1,7 +1,5 @@
 """Points that contradict the fit: each is named with its log, and can be excluded there."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Typed fields of a rig, and changes of the text of a rig file."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The state of the steps comes from the files of the folder: resumed, finished elsewhere, or damaged."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from pathlib import Path

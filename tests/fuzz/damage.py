@@ -1,7 +1,5 @@
 """Random damage to bytes and texts, drawn and shrunk by Hypothesis."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from hypothesis import strategies as st

@@ -3,8 +3,6 @@
 The first failure of each target is shrunk and shown; the job goes on with the next target.
 """
 
-from __future__ import annotations
-
 import sys
 import time
 import traceback

@@ -1,7 +1,5 @@
 """Small valid inputs for the fuzz job, created anew in each run."""
 
-from __future__ import annotations
-
 import struct
 from functools import cache
 from pathlib import Path

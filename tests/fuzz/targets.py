@@ -3,8 +3,6 @@
 If a reader refuses its input, it writes nothing. No input takes more than a few seconds of the processor.
 """
 
-from __future__ import annotations
-
 import asyncio
 import json
 import time

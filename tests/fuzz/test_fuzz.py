@@ -1,7 +1,5 @@
 """A short fuzz job: a few cases for each reader of untrusted data; ``scripts/fuzz`` runs many."""
 
-from __future__ import annotations
-
 import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 

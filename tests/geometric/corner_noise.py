@@ -6,8 +6,6 @@ rank 6. This module repeats that fit for edges with a known noise. The constants
 of the simulator.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -5,8 +5,6 @@ them into a position. The difference from the true centre is the error of the ca
 no noise of an image.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -282,10 +280,7 @@ def locate_with_model(
     applied = {camera.camera: AppliedModel(model.name, camera) for camera in model.cameras}
 
     def locate(
-        camera: str,
-        corners_px: Array,
-        heights_m: Array,
-        covariances_px2: Array | None = None,
+        camera: str, corners_px: Array, heights_m: Array, covariances_px2: Array | None = None
     ) -> tuple[Array, Array | None]:
         if camera not in applied:
             return np.full((len(corners_px), 3), np.nan), None

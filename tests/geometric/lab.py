@@ -1,7 +1,5 @@
 """A simulated session without images: exact geometry, and markers with the noise of ``detect``."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace

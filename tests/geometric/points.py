@@ -1,7 +1,5 @@
 """Calibration points of a session without images, chosen as in the rendered lab, many candidates at once."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

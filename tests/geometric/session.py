@@ -1,7 +1,5 @@
 """Messages of a simulated session without images: rig, calibrations, markers, measurements, ground truth."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import replace
@@ -142,13 +140,7 @@ def _measured(lab: GeometricLab) -> Iterator[_Row]:
             splits = ("train",) if index < lab.settings.points else ("test",)
             measurement = _measurement(lab, pose, index, times_ns, splits)
             index += 1
-            yield (
-                times_ns[-1] + _MEASURED_NS,
-                MEASUREMENTS_TOPIC,
-                measurement,
-                measurement.timestamp,
-                None,
-            )
+            yield (times_ns[-1] + _MEASURED_NS, MEASUREMENTS_TOPIC, measurement, measurement.timestamp, None)
 
 
 def _measurement(

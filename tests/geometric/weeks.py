@@ -1,7 +1,5 @@
 """Logs of several weeks without images: reference markers, slow changes, and a camera that is knocked."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace

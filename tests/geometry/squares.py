@@ -1,7 +1,5 @@
 """Synthetic markers with known lenses: corners by OpenCV's projection, rotations by SciPy."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

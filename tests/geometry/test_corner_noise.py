@@ -1,7 +1,5 @@
 """The propagated corner noise, compared with manual derivatives and with samples."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Lenses compared with the formulas of their models, written out here."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -88,8 +86,7 @@ def test_lens_equality_compares_the_distortion() -> None:
 
 
 @pytest.mark.parametrize(
-    ("model", "d"),
-    [("kannala_brandt", FISHEYE), ("plumb_bob", PINHOLE), ("rational_polynomial", RATIONAL)],
+    ("model", "d"), [("kannala_brandt", FISHEYE), ("plumb_bob", PINHOLE), ("rational_polynomial", RATIONAL)]
 )
 def test_projection_of_no_points_is_empty(model: str, d: tuple[float, ...]) -> None:
     assert project(np.zeros((0, 3)), lens(model, d)).shape == (0, 2)

@@ -1,7 +1,5 @@
 """Eq. (3) to (5) compared with a marker at a known position."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

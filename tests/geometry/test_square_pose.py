@@ -1,7 +1,5 @@
 """Estimated poses of squares, compared with the poses that gave the corners."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

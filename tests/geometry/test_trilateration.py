@@ -1,7 +1,5 @@
 """Eq. (25) compared with points at known distances."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import assume, given

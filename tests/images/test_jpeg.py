@@ -1,7 +1,5 @@
 """Partial decoding of a JPEG gives the same pixels as full decoding, and damage is detected."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 from contextlib import suppress
@@ -276,10 +274,7 @@ def test_an_interval_too_many_does_not_shift_the_picture() -> None:
     check(scene, scene.data[: marks[3]] + scene.data[marks[2] :], 2)
 
 
-@pytest.mark.parametrize(
-    "interval",
-    [0, 64],
-)
+@pytest.mark.parametrize("interval", [0, 64])
 @pytest.mark.parametrize("size", [(512, 256), (1024, 64)])
 def test_any_bit_of_the_header_may_be_wrong(size: tuple[int, int], interval: int) -> None:
     """A frame of an untrusted log gives a FrameError or an image, and no other error."""

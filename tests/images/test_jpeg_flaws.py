@@ -1,7 +1,5 @@
 """Flaws of JPEG streams that lose no pixel are read; damage stays an error."""
 
-from __future__ import annotations
-
 import os
 import re
 from collections.abc import Callable

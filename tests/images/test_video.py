@@ -1,7 +1,5 @@
 """Markers in a video: the images equal those of FFmpeg's own decoder."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 from dataclasses import replace

@@ -15,7 +15,6 @@ from ipsys_log.calibration.joint.from_messages import gather_observations
 from ipsys_log.calibration.joint.observations import Observations, without_points
 from ipsys_log.calibration.joint.settings import JointSettings
 from ipsys_log.capture.simulation.settings import LabSettings
-from ipsys_log.errors import FitError
 from ipsys_log.messages import CameraCalibration, Markers, Measurement, Message, Rig
 from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab
 from tests.geometric.session import simulate_session
@@ -124,18 +123,6 @@ def test_slopes_of_paths_match_differences() -> None:
         units = scale[count + below + rows] * scale[count + rows]
         banded = diagonal[: len(rows)] / units
         assert np.abs(banded - squares[count + below + rows, count + rows]).max() < 1e-5
-
-
-def test_drive_without_two_measured_points_is_refused() -> None:
-    observations = observe(make_drive(25.0, points=4))
-    with pytest.raises(FitError, match="1 measured points"):
-        fit_jointly(
-            replace(
-                observations,
-                points=observations.points[:1],
-                sightings=tuple(one.select(one.point < 1) for one in observations.sightings),
-            )
-        )
 
 
 def test_fit_twice_is_identical() -> None:

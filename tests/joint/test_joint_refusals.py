@@ -42,7 +42,7 @@ def test_camera_without_overlap_and_tape_is_refused() -> None:
         observations, sightings=(observations.sightings[0], observations.sightings[1].select(alone))
     )
     assert second - first
-    with pytest.raises(FitError, match="camera c1: it sees fewer than two measured points"):
+    with pytest.raises(FitError, match="camera c1: it sees fewer than two measured points, and no marker"):
         fit_jointly(keep_points(cut, first))
 
 

@@ -68,17 +68,3 @@ def test_one_measured_point_is_refused(lab: tuple[Observations, Truth]) -> None:
     observations, _ = lab
     with pytest.raises(FitError, match="measure at least two points with the tape, some metres apart"):
         place_cameras(measured_only(observations, {0}))
-
-
-def test_camera_without_a_shared_marker_is_named(lab: tuple[Observations, Truth]) -> None:
-    observations, _ = lab
-    first, second = seen_by(observations)
-    apart = replace(
-        observations,
-        sightings=tuple(
-            sightings.select(np.isin(sightings.point, sorted(own)))
-            for sightings, own in zip(observations.sightings, (first, second - first), strict=True)
-        ),
-    )
-    with pytest.raises(FitError, match="camera c1: it sees fewer than two measured points, and no marker"):
-        place_cameras(measured_only(apart, first))

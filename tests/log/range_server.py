@@ -1,7 +1,5 @@
 """An HTTP server with byte ranges and ETags on loopback, whose faults a test chooses."""
 
-from __future__ import annotations
-
 import hashlib
 import re
 import threading

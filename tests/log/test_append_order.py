@@ -1,7 +1,5 @@
 """An interrupted append, as other processes see it: without the journal, and on a failing disk."""
 
-from __future__ import annotations
-
 import errno
 import os
 import random

@@ -1,7 +1,5 @@
 """A small file cannot cost much time or memory; a true recording is never refused."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -79,11 +77,7 @@ def run(*arguments: object) -> Cost:
     command += map(str, arguments)
     environment = os.environ | {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
     with subprocess.Popen(
-        command,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        env=environment,
-        text=True,
+        command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, env=environment, text=True
     ) as process:
         assert process.stderr is not None
         err = process.stderr.read()

@@ -1,7 +1,5 @@
 """Payloads keep every bit in the log, and the schemas are those of the package."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from dataclasses import fields
@@ -116,10 +114,7 @@ def test_log_is_readable_with_its_own_schemas(payload: Any) -> None:
 
 
 @given(
-    times,
-    st.text(),
-    st.text(),
-    st.sampled_from([0, 127, 128, (32 << 10) - 1, 32 << 10, 100_000, 1 << 21]),
+    times, st.text(), st.text(), st.sampled_from([0, 127, 128, (32 << 10) - 1, 32 << 10, 100_000, 1 << 21])
 )
 def test_long_bytes_are_set_where_protobuf_sets_them(time: int, frame: str, text: str, size: int) -> None:
     data = bytes(range(256)) * (size // 256) + bytes(size % 256)

@@ -1,7 +1,5 @@
 """Columns of messages equal the payloads of the codec for all message contents."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """First and last times of a topic: those of all its times, with few indexes read."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from tempfile import TemporaryDirectory
 

@@ -1,7 +1,5 @@
 """Messages are readable by their number while the log is written."""
 
-from __future__ import annotations
-
 from contextlib import closing
 from pathlib import Path
 

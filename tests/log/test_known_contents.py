@@ -1,7 +1,5 @@
 """A command parses the summary of a log once, and again only if another process has changed the file."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A listing of 10,000 objects of an S3 server on loopback: the requests of a pattern and of the catalogue."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Ranges of an object in a store: the right bytes, few requests, and a bounded cache."""
 
-from __future__ import annotations
-
 import random
 from itertools import pairwise
 from typing import Any

@@ -1,7 +1,5 @@
 """Logs at URLs: the same results as from a file, and one clear line for each fault of a server."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Iterator

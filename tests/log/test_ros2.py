@@ -1,7 +1,5 @@
 """Logs of ROS 2, written by another library."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

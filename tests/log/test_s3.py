@@ -1,7 +1,5 @@
 """Logs in an S3 server on loopback: the same results as from a file, versions, and lists of many pages."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Times within messages are shifted: all other fields stay, and damage is reported."""
 
-from __future__ import annotations
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st

@@ -1,7 +1,5 @@
 """Messages of every size up to a whole chunk: long ones use other code paths."""
 
-from __future__ import annotations
-
 import random
 import tempfile
 from collections import Counter

@@ -1,7 +1,5 @@
 """Schemas that released logs hold are compatible with those of today: fields are only ever added."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from pathlib import Path
 

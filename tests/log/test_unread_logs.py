@@ -1,7 +1,5 @@
 """A log that cannot be read is not called broken: its content is unknown."""
 
-from __future__ import annotations
-
 from itertools import count
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Commands that write new files from logs at URLs, and logs without write permission."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess
@@ -129,11 +127,7 @@ def test_results_of_a_read_only_disk_come_into_the_working_folder(here: Path, ip
 
 @pytest.mark.parametrize(
     ("key", "name"),
-    [
-        ("lab/2026-05/a.mcap", "2026-05/a.mcap"),
-        ("lab/../../etc/a.mcap", "a.mcap"),
-        ("lab//a.mcap", "a.mcap"),
-    ],
+    [("lab/2026-05/a.mcap", "2026-05/a.mcap"), ("lab/../../etc/a.mcap", "a.mcap"), ("lab//a.mcap", "a.mcap")],
 )
 def test_derived_log_keeps_the_folders_of_a_pattern(key: str, name: str, here: Path) -> None:
     log = LogUrl("s3://lab/*/a.mcap", key)

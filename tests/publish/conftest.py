@@ -1,7 +1,5 @@
 """Packs of a small log, made once."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

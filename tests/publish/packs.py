@@ -1,7 +1,5 @@
 """Packs for tests: a small log of calibration points, and changes of a pack with valid checksums."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Callable

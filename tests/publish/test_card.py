@@ -1,7 +1,5 @@
 """The dataset card: its form, its errors, and texts that stay texts in Markdown."""
 
-from __future__ import annotations
-
 import html
 import json
 import re

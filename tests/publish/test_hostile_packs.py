@@ -1,7 +1,5 @@
 """Damaged and hostile packs: one line, exit code 1, nothing is written, and nothing is extracted."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """The leaderboard: all models on all datasets in one table."""
 
-from __future__ import annotations
-
 import importlib
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """Packs: their content, their scores, and the comparison of a repetition with them."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json

@@ -1,7 +1,5 @@
 """Datasets at an address: the archive is downloaded with fsspec, and scored as a file."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 from functools import partial

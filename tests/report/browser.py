@@ -1,7 +1,5 @@
 """A page in a real browser: its requests, its image sizes, and its width."""
 
-from __future__ import annotations
-
 import html
 import json
 import re

@@ -1,7 +1,5 @@
 """Evaluated logs, for tables, figures and pages."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

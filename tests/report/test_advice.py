@@ -1,7 +1,5 @@
 """The advice on the number of points and on the model, with its reasons."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import replace

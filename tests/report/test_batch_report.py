@@ -1,7 +1,5 @@
 """The answer of a batch: a row for each log, or for each state, and a line for each failure."""
 
-from __future__ import annotations
-
 import io
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The figure of a session: complete, legible, of the right size, for all data."""
 
-from __future__ import annotations
-
 import io
 from dataclasses import replace
 from itertools import combinations

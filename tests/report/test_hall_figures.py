@@ -1,7 +1,5 @@
 """Figures of a hall with 24 cameras: no tangle of lines, no long row, and the worst cameras first."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any

@@ -1,7 +1,5 @@
 """``ipsys report``: one page without a network, safe with any name, and readable on a phone."""
 
-from __future__ import annotations
-
 import os
 import pty
 import re

@@ -1,7 +1,5 @@
 """The page of a recording without calibration points: cameras, gaps, events and latency."""
 
-from __future__ import annotations
-
 import html
 import re
 import shlex

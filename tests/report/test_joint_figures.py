@@ -1,7 +1,5 @@
 """Figures of the cameras of a joint calibration: in files, and on the page."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

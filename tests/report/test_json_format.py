@@ -1,7 +1,5 @@
 """JSON is in SI units and says its format; ``--json=1`` has the keys of format 1."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Tables and maps of a hall with 24 cameras: no line over 80 columns, and names on the map."""
 
-from __future__ import annotations
-
 import io
 from itertools import pairwise
 from typing import Any

@@ -1,7 +1,5 @@
 """The files of ``--plot`` into a folder: the numbers of the JSON, and legible figures."""
 
-from __future__ import annotations
-
 import base64
 import csv
 import io

@@ -1,7 +1,5 @@
 """Markers and boards on paper: a PDF is rendered and measured in a simulated camera."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

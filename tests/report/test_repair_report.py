@@ -1,7 +1,5 @@
 """The terminal report of a repaired log."""
 
-from __future__ import annotations
-
 import io
 import os
 from collections.abc import Sequence

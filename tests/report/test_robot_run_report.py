@@ -1,7 +1,5 @@
 """Tables, JSON and page of a robot run whose errors follow from its messages by hand."""
 
-from __future__ import annotations
-
 import base64
 import io
 import json

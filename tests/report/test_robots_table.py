@@ -1,7 +1,5 @@
 """The robots on the display of a recording: named robots first, in cm and degrees, as many as fit."""
 
-from __future__ import annotations
-
 import io
 import math
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The summary of an evaluation comes first, fits a terminal, and has the figures of the JSON."""
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Sequence

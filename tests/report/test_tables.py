@@ -1,7 +1,5 @@
 """The tables of an evaluation fit a terminal, and control characters from a log have no effect."""
 
-from __future__ import annotations
-
 import io
 import re
 from collections.abc import Sequence

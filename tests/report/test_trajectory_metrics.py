@@ -1,7 +1,5 @@
 """The trajectory metrics are those of evo, and the tables and the JSON have them."""
 
-from __future__ import annotations
-
 import copy
 import io
 from collections.abc import Iterator

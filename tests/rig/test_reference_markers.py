@@ -1,7 +1,5 @@
 """Reference markers in the rig: the file, its faults, and the stages that must leave them out."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

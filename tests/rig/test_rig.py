@@ -1,7 +1,5 @@
 """The rig file: read, checked, and written so that it reads back."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from pathlib import Path

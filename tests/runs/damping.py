@@ -3,8 +3,6 @@
 Run as a program, it is ``ipsys`` with this stage: ``python -m tests.runs.damping replay LOG``.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import replace

@@ -7,8 +7,6 @@ environment, and for each channel the hash of its bytes and some of its numbers.
 higher version is a mistake.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import json

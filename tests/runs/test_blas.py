@@ -1,7 +1,5 @@
 """One thread for linear algebra: the last bits of results depend on the number of threads."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

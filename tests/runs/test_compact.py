@@ -1,7 +1,5 @@
 """Compaction of logs: the dropped runs, and the provenance of the kept runs."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Iterator

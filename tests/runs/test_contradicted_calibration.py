@@ -1,7 +1,5 @@
 """A log whose markers contradict the intrinsics: detection, info and check say it."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

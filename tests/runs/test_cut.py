@@ -1,7 +1,5 @@
 """Cuts of logs: the messages of a part are those of the whole that the options select."""
 
-from __future__ import annotations
-
 import io
 import itertools
 from collections.abc import Callable, Iterator

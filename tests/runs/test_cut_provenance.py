@@ -1,7 +1,5 @@
 """Provenance of parts of logs: their runs are neither out of date nor computed again because of the cut."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

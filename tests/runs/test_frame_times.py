@@ -1,7 +1,5 @@
 """Times of images from their markers: the same as from the indexes of the images."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

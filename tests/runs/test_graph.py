@@ -1,7 +1,5 @@
 """The graph of stages: a stage is one row, and channels with the same payload type are distinct."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

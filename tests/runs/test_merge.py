@@ -1,7 +1,5 @@
 """Merges of logs: the messages of all logs at the times of the first clock."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path

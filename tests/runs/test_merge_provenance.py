@@ -1,7 +1,5 @@
 """Provenance of merged logs: the runs of all recorders, and new results at the times of one clock."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Iterator
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Appends of messages to an open log."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
@@ -16,8 +14,5 @@ def test_a_frame_of_another_schema_is_refused_by_its_topic(tmp_path: Path) -> No
     topic = "/cameras/red/image"
     picture = Message(topic, 1, 1, CompressedImage(1, "red", b"\xff\xd8", "jpeg"), "red")
     video = Message(topic, 2, 2, CompressedVideo(2, "red", b"\0\0\1", "h264"), "red")
-    with (
-        LogWriter.create(tmp_path / "a.mcap") as writer,
-        pytest.raises(LogError, match="/cameras/red/image"),
-    ):
+    with LogWriter.create(tmp_path / "a.mcap") as writer, pytest.raises(LogError, match="/cameras/red/image"):
         write_messages(writer, [picture, video])

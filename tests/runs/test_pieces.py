@@ -1,7 +1,5 @@
 """Pieces of a run: their bounds, and the merge of their results with the bytes of one process."""
 
-from __future__ import annotations
-
 import pickle
 from collections.abc import Iterator
 from dataclasses import replace

@@ -3,8 +3,6 @@
 The tests of the functions have the further cases.
 """
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -127,8 +125,7 @@ FAR = edit(
     CameraPoints, lambda one: replace(one, points=tuple(replace(point, x_m=1e9) for point in one.points))
 )
 NO_PARAMETERS = edit(
-    Model,
-    lambda model: replace(model, cameras=tuple(replace(one, parameters=()) for one in model.cameras)),
+    Model, lambda model: replace(model, cameras=tuple(replace(one, parameters=()) for one in model.cameras))
 )
 OTHER_CAMERAS = edit(
     Model,
@@ -142,7 +139,6 @@ A, B = Distance("A", 2.0), Distance("B", 2.0)
 
 CASES: dict[str, Case] = {
     # Settings of the log.
-    "no_rig": Case(said="has no rig", change=without(Rig)),
     "no_calibration_edges": Case(
         said="has no calibration in the log, but the corner method edges needs one",
         change=without(CameraCalibration), log="lab", command="detect LOG --corners edges",
@@ -205,8 +201,6 @@ CASES: dict[str, Case] = {
     # Models of other logs.
     "no_such_model": Case(said="has no fitted model best", command="fit LOG --model best --model-from MODEL"),
     "no_such_model_live": Case(said="has no fitted model best", command=f"{MODEL_FROM} --model best"),
-    "no_format": Case(said="-o NAME.mp4 (a video)", command="export LOG"),
-    "no_point": Case(said="has no calibration point 'p9'", command="exclude LOG p9"),
     "no_reason": Case(said="--reason: is missing", command="exclude LOG s001"),
     "other_cameras": Case(said="model is for the cameras", command=MODEL_FROM, change_model=OTHER_CAMERAS),
     "other_lenses": Case(

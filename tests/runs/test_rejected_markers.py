@@ -1,7 +1,5 @@
 """Remarks of detection on markers that are seen and cannot be measured."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from ipsys_log.engine.output import write_log

@@ -1,7 +1,5 @@
 """Runs: names of stage results, reused only if they are complete."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """The output of every stage equals the stored output; a change needs a higher version."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

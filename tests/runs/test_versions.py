@@ -1,7 +1,5 @@
 """Versions of stages: results of older software are recognised, and computed again beside them."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Worker processes: the same bytes with any number of them, and their ends, killed or interrupted."""
 
-from __future__ import annotations
-
 import errno
 import multiprocessing.connection
 import shutil

@@ -4,8 +4,6 @@ A case runs in a separate folder with copies of its inputs. Afterwards, all file
 output of each command with ``--json`` are compared.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 

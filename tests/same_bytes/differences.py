@@ -4,8 +4,6 @@ Nothing here imports ``ipsys_log``. The ``mcap`` package reads the logs, and the
 a fault of the code under test cannot hide itself.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import struct
@@ -166,10 +164,7 @@ def _compare_topic(
 
 
 def _first_field_of(
-    old: bytes,
-    new: bytes,
-    old_schema: Definition | None,
-    new_schema: Definition | None,
+    old: bytes, new: bytes, old_schema: Definition | None, new_schema: Definition | None
 ) -> str:
     try:
         messages = decode(old, old_schema), decode(new, new_schema)

@@ -5,8 +5,6 @@ with commands and options. Each command runs in a process that is forked from th
 one. There the libraries are imported already, and the project is not.
 """
 
-from __future__ import annotations
-
 import hashlib
 import importlib
 import importlib.util

@@ -3,8 +3,6 @@
 Both commits get the same files, so a case differs only where its own commands do.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re

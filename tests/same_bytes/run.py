@@ -20,8 +20,6 @@ Nothing is masked. Both commits run with the same environment variables, relativ
 of input files. They record with a scripted clock. Exit code: 0 equal, 1 different, 2 usage.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

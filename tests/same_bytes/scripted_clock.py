@@ -21,8 +21,6 @@ The functions behave as follows.
 work. The states of the threads come from ``/proc``: this needs Linux.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 import threading

@@ -1,7 +1,5 @@
 """The comparison finds and names differences, and accepts the allowed ones."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """A session without images agrees with OpenCV's projection of the ground truth."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A hall: cameras in a grid that see its whole floor, and robots that drive over all of it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The way and the speed of robots that stop and start again."""
 
-from __future__ import annotations
-
 import importlib
 from typing import Any
 

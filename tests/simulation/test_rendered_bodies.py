@@ -1,7 +1,5 @@
 """A free body in rendered images with a rolling shutter: detection and its poses against the ground truth."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -180,9 +180,7 @@ def test_robots_are_stationary_before_their_start() -> None:
     assert drive.poses_at(1e-2) != drive.poses_at(0.0)
 
 
-def test_corners_follow_the_exposure_time_of_their_row(
-    session: list[Message],
-) -> None:
+def test_corners_follow_the_exposure_time_of_their_row(session: list[Message]) -> None:
     drive, start_ns, cameras = drive_of(LAB)
     detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_100))
     off_px: dict[str, list[Array]] = {"own row": [], "frame": []}

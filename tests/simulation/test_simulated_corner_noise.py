@@ -1,7 +1,5 @@
 """The noise of simulated corners: its covariance, its structure, and its size."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """Two autopilots as receivers of poses: the values that their filters take. docs/streams.md has the rules."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from math import atan2, hypot, isfinite, isnan, nan
 from typing import Any

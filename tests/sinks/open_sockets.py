@@ -1,7 +1,5 @@
 """The local addresses of the sockets of a process, from /proc: those that other computers could reach."""
 
-from __future__ import annotations
-
 import ipaddress
 import re
 import struct

@@ -1,7 +1,5 @@
 """Logs with tracks for tests of streams, and a clock that advances only while a playback waits."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The map beside the cameras in a video: robots, predictions, trails and reference points at their pixels."""
 
-from __future__ import annotations
-
 import colorsys
 from dataclasses import replace
 from itertools import combinations

@@ -1,7 +1,5 @@
 """The layout of Foxglove for a log: its topics, message paths, settings and user scripts."""
 
-from __future__ import annotations
-
 import json
 import re
 import runpy

@@ -1,7 +1,5 @@
 """Foxglove stream: the client of Foxglove gets the messages; foreign pages and clients get nothing."""
 
-from __future__ import annotations
-
 import base64
 import json
 import os

@@ -1,7 +1,5 @@
 """MAVLink stream: pymavlink as the autopilot gets poses in its own axes, and disturbs nothing."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager

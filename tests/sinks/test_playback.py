@@ -1,7 +1,5 @@
 """Playback: exact spacing of capture times, pauses, steps, seeks and loops with a new session number."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The Rerun layout of a hall in the saved recording: whole frames, visible symbols, the whole floor."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Rerun reads the live recording, without a screen."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from collections.abc import Callable

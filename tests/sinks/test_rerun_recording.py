@@ -1,7 +1,5 @@
 """A session saved for Rerun, and read with Rerun's own reader."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from collections.abc import Iterable, Iterator, Mapping

@@ -1,7 +1,5 @@
 """Time series of a recording for Rerun: disagreement of cameras, latency, and the plots that show them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """A seek of the player: receivers of every protocol learn that the time goes back."""
 
-from __future__ import annotations
-
 import json
 import socket
 from contextlib import ExitStack, closing

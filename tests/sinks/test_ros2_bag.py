@@ -1,7 +1,5 @@
 """A ROS 2 bag has the images, intrinsics, poses and covariances of the log, as other libraries read them."""
 
-from __future__ import annotations
-
 import tracemalloc
 from collections import defaultdict
 from dataclasses import replace

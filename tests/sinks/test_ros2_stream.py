@@ -1,7 +1,5 @@
 """ROS 2 stream: a Zenoh session gets the messages of rmw_zenoh; nothing passes in or through."""
 
-from __future__ import annotations
-
 import os
 import socket
 import struct

@@ -1,7 +1,5 @@
 """Sinks: a slow sink loses images first, a failing sink ends no recording, an inline sink has no thread."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """UDP stream: the receiver of the documentation gets the poses, and drops old, foreign and forged ones."""
 
-from __future__ import annotations
-
 import hashlib
 import hmac
 import json

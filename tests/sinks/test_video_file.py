@@ -1,7 +1,5 @@
 """A video shows the cameras with their markers, and the robots at their places on the floor."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path

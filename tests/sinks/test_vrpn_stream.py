@@ -1,7 +1,5 @@
 """VRPN server: an independent client gets the poses; wrong clients disturb neither it nor the stream."""
 
-from __future__ import annotations
-
 import json
 import socket
 import struct

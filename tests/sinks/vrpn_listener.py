@@ -3,8 +3,6 @@
 It runs as a process of its own: the client of VRPN prints to the terminal, and may wait without an end.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 

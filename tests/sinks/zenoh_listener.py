@@ -1,7 +1,5 @@
 """A session of Zenoh as a node of ROS 2 opens it, and the messages that it receives."""
 
-from __future__ import annotations
-
 import json
 import threading
 from typing import Any

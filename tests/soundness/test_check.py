@@ -1,7 +1,5 @@
 """The check of logs: sound logs of each kind, and a damaged or changed log for each finding."""
 
-from __future__ import annotations
-
 import json
 import zlib
 from collections.abc import Callable

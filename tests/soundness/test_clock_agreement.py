@@ -1,7 +1,5 @@
 """Clock estimates of nodes against the joint calibration of a simulated drive with known clock offsets."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

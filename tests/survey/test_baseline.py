@@ -1,7 +1,5 @@
 """The distance AB, read with the tape: its entry, its withdrawal, the terminal and the page."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from dataclasses import replace

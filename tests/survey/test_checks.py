@@ -1,7 +1,5 @@
 """The check of one point: its position, and its faults."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Typed entries: mixed units, missing fields, and text that is not a number."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """Exclusion of calibration points: what the stages read, and what the log then says."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The calibration beside a recording: its lines, and its independence of errors."""
 
-from __future__ import annotations
-
 import re
 from collections import deque
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Live measurement: detection of a marker that is still at its measured point."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from ipsys_log.capture.frames import CameraState

@@ -1,7 +1,5 @@
 """Doubtful rows of a sheet: named with their contradiction, and written only on request."""
 
-from __future__ import annotations
-
 import io
 import re
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Accessibility of a page in a browser, judged by axe-core."""
 
-from __future__ import annotations
-
 from functools import cache
 
 from tests.node_packages import install

@@ -1,7 +1,5 @@
 """One browser for all tests of a worker; each test has its own cookies and pages."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import pytest

@@ -1,7 +1,5 @@
 """The contrast of WCAG 2.2, of all visible parts of a page."""
 
-from __future__ import annotations
-
 from tests.web.phone import Phone
 
 # Text needs 4.5 to 1, large text and the edges of fields 3 to 1 (success criteria 1.4.3 and 1.4.11).

@@ -1,7 +1,5 @@
 """A dashboard of a recording that a test feeds with messages, and its page."""
 
-from __future__ import annotations
-
 import queue
 import threading
 from collections.abc import Iterable, Iterator

@@ -1,7 +1,5 @@
 """A phone: headless Chromium of phone size, controlled by taps and keys through its debugging pipe."""
 
-from __future__ import annotations
-
 import base64
 import fcntl
 import json

@@ -1,7 +1,5 @@
 """Pictures of pages for the documentation: the first screen, with fewer colours, so that files are small."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from PIL import Image

@@ -1,7 +1,5 @@
 """Access to the page needs the token and the address. All other requests are refused."""
 
-from __future__ import annotations
-
 import http.client
 import json
 import socket

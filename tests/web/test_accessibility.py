@@ -1,7 +1,5 @@
 """Accessibility of all pages: axe-core finds no serious or critical fault, light and dark."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

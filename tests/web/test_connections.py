@@ -1,7 +1,5 @@
 """Connections to the measuring page: bounded in number and time, without effect on a recording."""
 
-from __future__ import annotations
-
 import errno
 import http.client
 import json

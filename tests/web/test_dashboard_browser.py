@@ -1,7 +1,5 @@
 """The dashboard in a browser: its content, its keyboard, its sizes and its colours."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path

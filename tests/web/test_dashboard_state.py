@@ -1,7 +1,5 @@
 """The state of the dashboard: messages as input, the JSON of the pages as output."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import math

@@ -1,7 +1,5 @@
 """The dashboard of a hall with 24 cameras and nine robots: each part can be read on any screen."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

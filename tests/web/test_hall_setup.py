@@ -1,7 +1,5 @@
 """The setup page of a hall with 24 cameras: short texts, compact cards, and faults first, on any screen."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path

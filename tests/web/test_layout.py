@@ -1,7 +1,5 @@
 """The layout of the measuring page: no part too wide, covered, hidden or hard to see, on any screen."""
 
-from __future__ import annotations
-
 import fcntl
 
 import pytest

@@ -1,7 +1,5 @@
 """Frozen pages and lost networks: recordings go on, and a page that comes back shows the present state."""
 
-from __future__ import annotations
-
 import os
 import signal
 import socket

@@ -1,7 +1,5 @@
 """The measuring page on a phone: taps and keys as input, measurements in the log as output."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Network cameras on the setup page: a real RTSP server, its password, nodes, and faults at their fields."""
 
-from __future__ import annotations
-
 import json
 import threading
 from collections.abc import Iterator

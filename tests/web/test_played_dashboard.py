@@ -1,7 +1,5 @@
 """The dashboard of a played log: ``ipsys stream LOG --web``."""
 
-from __future__ import annotations
-
 import json
 import re
 import socket

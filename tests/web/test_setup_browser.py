@@ -1,7 +1,5 @@
 """The first day in a browser: from an empty folder to tracked robots, on any screen, by keyboard."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The server of the setup page: faults at fields, refused requests, and one job for all devices."""
 
-from __future__ import annotations
-
 import http.client
 import json
 import threading

@@ -152,11 +152,6 @@ def plan_exports(
     ----------
     logs : logs, folders and patterns, as :func:`ipsys_log.log.log_files.name_places` names them.
     folder : of the files.
-
-    Raises
-    ------
-    IpsysError
-        There is no such format or table, a library is missing, or two logs would have the same file.
     """
     suffix = (EXPORT_FORMATS[format].suffix or "") if format in EXPORT_FORMATS else ""
     target = folder / f"log{suffix}"

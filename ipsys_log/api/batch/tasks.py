@@ -132,13 +132,7 @@ def perform(task: BatchTask, path: LogLocation) -> LogResult:
 
 
 def perform_or_divide(task: BatchTask, path: LogLocation) -> LogResult | LongLog:
-    """Do the work on a log as :func:`perform`, but not on a long log.
-
-    Raises
-    ------
-    VersionError
-        The worker has another version than the batch.
-    """
+    """Do the work on a log as :func:`perform`, but not on a long log."""
     try:
         return perform(replace(task, options={**task.options, "workers": LongLogs()}), path)
     except LongLogError:

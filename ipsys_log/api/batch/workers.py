@@ -70,13 +70,7 @@ class Workers:
         return self.local or max(_LEAST_WAITING, 2 * sum(self.client.nthreads().values()))
 
     def check_connection(self) -> None:
-        """Check that the batch goes on.
-
-        Raises
-        ------
-        IpsysError
-            The scheduler was lost, or the batch ends.
-        """
+        """Check that the batch goes on."""
         if self.is_stopped or self.client.status in ("closing", "closed"):
             raise IpsysError(
                 f"the scheduler {self.address} was lost; results so far are in the logs; to continue, repeat "
@@ -170,13 +164,7 @@ class WorkerSettings:
     insecure: bool = False
 
     def check(self) -> None:
-        """Check that the settings fit together, and that an existing scheduler is protected.
-
-        Raises
-        ------
-        IpsysError
-            An option has no effect, a file is missing, or the scheduler has no certificates.
-        """
+        """Check that the settings fit together, and that an existing scheduler is protected."""
         files = {"--tls-ca": self.tls_ca, "--tls-cert": self.tls_cert, "--tls-key": self.tls_key}
         if self.scheduler is None:
             unused = [name for name, file in files.items() if file] + ["--insecure"] * self.insecure
@@ -262,13 +250,7 @@ def _security(address: str, settings: WorkerSettings) -> Security | None:
 
 
 def _check_versions(client: Client) -> None:
-    """Check that all workers have this version of ipsys. Each task checks the worker that does it, too.
-
-    Raises
-    ------
-    IpsysError
-        A worker has another version, or none.
-    """
+    """Check that all workers have this version of ipsys. Each task checks the worker that does it, too."""
     ask: Callable[[str], str] = importlib.metadata.version
     versions = client.run(ask, _DISTRIBUTION, on_error="return")
     for worker, version in sorted(versions.items()):

@@ -61,7 +61,7 @@ def calibrate_body(
     from ipsys_log.log.dataset import Session
     from ipsys_log.messages.rig_file import load_rig
     from ipsys_log.sinks.selection import rig_in_force
-    from ipsys_log.tools.carried_body import calibrate_carried_body
+    from ipsys_log.tools.carried_lab import calibrate_carried_body
 
     check_present(logs)
     if rig is not None and write is not None:

@@ -57,9 +57,7 @@ Terminal = Annotated[
 CarriedBody = Annotated[
     str | None,
     setting(
-        "--body",
-        "ROBOT",
-        "Use this body of the rig, which is carried by hand. Cameras may hang on walls.",
+        "--body", "ROBOT", "Use this body of the rig, which is carried by hand. Cameras may hang on walls."
     ),
 ]
 CarriedBoard = Annotated[

@@ -1,7 +1,5 @@
 """Import of other data into a log: recordings, tables, and the ground truth of another system."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable
 from pathlib import Path
@@ -253,7 +251,7 @@ def _import_truth(
     rig: Path | None,
     as_json: bool,
 ) -> None:
-    from ipsys_log.app.report.truth_import import truth_json, truth_lines
+    from ipsys_log.app.report.comparison import truth_json, truth_lines
     from ipsys_log.exchange.import_truth import TruthOptions, import_truth
     from ipsys_log.exchange.trajectory_columns import GivenUnits
     from ipsys_log.exchange.trajectory_tables import parse_offset, parse_pivot

@@ -53,11 +53,6 @@ def load_calibrations(
 
     ``assume`` is called with a camera and a text if its file does not state the lens model. The text and
     remarks on unusual values are printed.
-
-    Raises
-    ------
-    IpsysError
-        An option has another form, or a file contains no calibration.
     """
     if not options:
         return {}
@@ -240,11 +235,6 @@ def nominal_lenses(
         calibration.
     cameras, calibrated : all cameras, and those with a calibration.
     sizes_px : sizes of the images by camera.
-
-    Raises
-    ------
-    IpsysError
-        A text is not a number, or names no camera; or the size of an image is unknown.
     """
     from ipsys_log.calibration.lens_models import nominal_intrinsics
 

@@ -46,11 +46,6 @@ def prepare_lab(
     ----------
     only : the names of some cameras; otherwise all cameras with a source.
     with_lenses : also read the intrinsics that the rig names; False if they do not exist yet.
-
-    Raises
-    ------
-    IpsysError
-        The rig, the source of a camera, or a file of intrinsics has a fault.
     """
     from ipsys_log.capture.devices import check_sources, usb_advice
 
@@ -128,11 +123,6 @@ def open_cameras(
     doing : text printed at the start of a command that does not record; without it, the end reports frames.
     panel : the screen is free for a table of the cameras.
     until_stopped : a signal stops the cameras, and the command ends in order; otherwise it interrupts.
-
-    Raises
-    ------
-    IpsysError
-        A camera cannot be opened, or its frames do not fit its intrinsics.
     """
     from ipsys_log.app.report.cameras import LiveStatus
     from ipsys_log.capture.lab import open_lab

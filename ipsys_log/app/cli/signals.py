@@ -108,9 +108,7 @@ def note_kept(result: str) -> None:
 def say_kept(text: Callable[[Sequence[str]], str]) -> Iterator[None]:
     """Report the kept results on an interrupt within the block, or within a decorated function.
 
-    Parameters
-    ----------
-    text : is called after an interrupt with the results that `note_kept` noted in the block.
+    ``text`` is called after an interrupt with the results that `note_kept` noted in the block.
     """
     _state.kept.clear()
     try:

@@ -114,11 +114,6 @@ def choose_streams(
     has_page : the command also serves a page at the address of ``host``.
     options : fields of `StreamSettings`; for a server, whether it is wanted, and its port as ``vrpn_port``.
         None, False and empty lists are missing.
-
-    Raises
-    ------
-    IpsysError
-        There is no stream for an option, or the rig has no such robot.
     """
     from ipsys_log.messages.rig_file import check_robots
     from ipsys_log.sinks.streams.opening import settings_of_rig

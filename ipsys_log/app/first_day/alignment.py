@@ -51,13 +51,7 @@ class AlignmentResult:
 
 
 def read_result(session: Session, run: str) -> AlignmentResult:
-    """Read the alignment from a log of ``ipsys align``.
-
-    Raises
-    ------
-    IpsysError
-        The log cannot be read, or has no rig.
-    """
+    """Read the alignment from a log of ``ipsys align``."""
     rigs = session.payloads(session.topics(RIG))
     if not rigs:
         raise IpsysError(f"{session.paths[-1]}: has no rig; measure the alignment again")

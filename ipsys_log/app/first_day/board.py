@@ -30,13 +30,7 @@ class BoardEntry(NamedTuple):
     inverted: bool
 
     def parse(self) -> Board:
-        """Return the board.
-
-        Raises
-        ------
-        IpsysError
-            A value is not valid.
-        """
+        """Return the board."""
         return parse_board(self.board, self.square_m, self.marker_scale, self.dictionary, self.inverted)
 
 
@@ -59,9 +53,7 @@ BOARD_FIELDS: tuple[tuple[str, str, str, tuple[str, ...]], ...] = (
 def parse_board_entry(typed: Mapping[str, str]) -> BoardEntry | Fault:
     """Return the typed options; or the fault of a field, in the words of the command.
 
-    Parameters
-    ----------
-    typed : texts by field; a missing field has its usual text.
+    ``typed`` has the texts by field; a missing field has its usual text.
     """
     texts = {key: typed.get(key, usual).strip() for key, _, usual, _ in BOARD_FIELDS}
     try:

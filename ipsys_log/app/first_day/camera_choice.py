@@ -95,11 +95,6 @@ def save_cameras(path: Path, names: Mapping[str, str], attached: Sequence[UsbCam
     ----------
     names : the name of each used camera, by the key of its option; cameras without a name are not used.
     attached : the attached cameras that the user has seen.
-
-    Raises
-    ------
-    IpsysError
-        The rig file has a fault, or no camera has a name.
     """
     rig = load_rig(path)
     options = {option.key: option for option in list_options(rig, attached)}
@@ -158,13 +153,7 @@ def _write_cameras(path: Path, rig: Rig, cameras: Sequence[RigCamera]) -> None:
 
 
 def take_picture(camera: RigCamera, opener: Open, say: Say, is_stopped: Callable[[], bool]) -> bytes | None:
-    """Open a camera, and return its first image as JPEG or PNG; None if it sends none, or after a stop.
-
-    Raises
-    ------
-    IpsysError
-        The camera cannot be opened, or sends a damaged image.
-    """
+    """Open a camera, and return its first image as JPEG or PNG; None if it sends none, or after a stop."""
     clock = Clock()
     end_ns = clock.now_ns() + _LONGEST_WAIT_NS
     with opener(camera, clock, say) as frames:

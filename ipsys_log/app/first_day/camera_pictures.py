@@ -28,12 +28,7 @@ class _Picture(NamedTuple):
 
 
 class CameraPictures:
-    """The pictures of cameras. One thread at a time takes them, and others read the state.
-
-    Parameters
-    ----------
-    rig_file : the rig file of the lab.
-    """
+    """The pictures of cameras. One thread at a time takes them, and others read the state."""
 
     def __init__(self, rig_file: Path) -> None:
         self._rig_file = rig_file

@@ -90,9 +90,7 @@ class Job:
 class Jobs:
     """The jobs of a page: one at a time, because a camera can be open only once.
 
-    Attributes
-    ----------
-    present : the job that works, else the last one; None before the first job.
+    ``present`` is the job that works, else the last one; None before the first job.
     """
 
     def __init__(self) -> None:
@@ -108,13 +106,7 @@ class Jobs:
         return [*self._earlier_bugs, *present]
 
     def start(self, name: str, work: Callable[[Job], None], action: str = "") -> None:
-        """Start a job in its own thread.
-
-        Raises
-        ------
-        IpsysError
-            Another job works.
-        """
+        """Start a job in its own thread."""
         with self._lock:
             if self.present is not None and not self.present.ended:
                 raise IpsysError(f"{self.present.name} is not finished; wait for it, or stop it")

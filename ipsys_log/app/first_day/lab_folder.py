@@ -84,12 +84,7 @@ class FitFacts:
 
 
 class LabFolder:
-    """A folder with ``lab.toml``, intrinsics and logs. Any thread may read it.
-
-    Parameters
-    ----------
-    path : the folder; it exists.
-    """
+    """A folder with ``lab.toml``, intrinsics and logs. Any thread may read it."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -289,13 +284,7 @@ def find_outlier_points(paths: Sequence[Path], accuracies: Sequence[Accuracy]) -
 
 
 def exclude_outlier(paths: Sequence[Path], log: str, point: str) -> None:
-    """Exclude a calibration point from all stages (``ipsys exclude LOG POINT``); nothing is erased.
-
-    Raises
-    ------
-    IpsysError
-        There is no such log or no such point.
-    """
+    """Exclude a calibration point from all stages (``ipsys exclude LOG POINT``); nothing is erased."""
     found = next((path for path in paths if path.name == log), None)
     if found is None:
         raise IpsysError(f"the folder has no log {log!r} with calibration points; reload this page")

@@ -162,13 +162,7 @@ def rig_warnings(rig: Rig) -> list[str]:
 
 
 def save_rig_entry(path: Path, typed: Mapping[str, str]) -> list[Fault]:
-    """Write a typed rig into the rig file, which is made if it does not exist; return faults instead.
-
-    Raises
-    ------
-    IpsysError
-        The present rig file has a fault, or cannot be changed.
-    """
+    """Write a typed rig into the rig file, which is made if it does not exist; return faults instead."""
     text = path.read_text(encoding="utf-8") if path.exists() else example_toml()
     old = load_rig(path) if path.exists() else example_rig()
     new, faults = check_rig_entry(typed, old)

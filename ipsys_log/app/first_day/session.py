@@ -45,15 +45,6 @@ class SetupSession:
 
     Only pictures of cameras and the present job are in memory. An action raises an IpsysError if a job works,
     if an earlier step is missing, or if a file or a typed name has a fault.
-
-    Parameters
-    ----------
-    folder : the folder.
-    pages : the pages of the steps with live cameras.
-
-    Attributes
-    ----------
-    jobs : the present job.
     """
 
     def __init__(self, folder: LabFolder, pages: Pages) -> None:

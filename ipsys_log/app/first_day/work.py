@@ -120,12 +120,7 @@ def calibrate(folder: LabFolder, search: BoardSearch, pictures: Path, entry: Boa
 def drive(
     folder: LabFolder, show: Callable[[DriveCoverage], AbstractContextManager[object]], job: Job
 ) -> None:
-    """Record a drive until the job is stopped (``ipsys record``).
-
-    Parameters
-    ----------
-    show : shows the covered parts of the images.
-    """
+    """Record a drive until the job is stopped (``ipsys record``)."""
     with _new_log(folder, DRIVE_LOG) as log, _open_cameras(folder, job) as (opened, monitor):
         check_start(opened.rig, opened.lab.names, opened.lenses, Request(), "detect")
         with closing(DriveCoverage(opened.rig, opened.lab.names)) as coverage, show(coverage):
@@ -138,9 +133,7 @@ def measure_sheet(folder: LabFolder, sheet: Path, count: int | None, job: Job) -
 
     This is ``ipsys record``, and then ``ipsys measure LOG --csv SHEET``.
 
-    Parameters
-    ----------
-    count : number of rows, spread over the floor, without those near to a measured point; None: all rows.
+    ``count`` rows are spread over the floor, without those near to a measured point; None: all rows.
     """
     with _new_log(folder, "calibration") as log:
         _record(folder, job, log, _SHEET_S)
@@ -172,10 +165,6 @@ def measure(folder: LabFolder, show: Callable[[LiveScene], AbstractContextManage
     """Measure points with live cameras until the job is stopped (``ipsys record --measure --points-only``).
 
     Then the markers are detected, so that the points of each camera can be counted.
-
-    Parameters
-    ----------
-    show : shows the measuring page of a scene.
     """
     with _new_log(folder, "calibration") as log:
         with _open_cameras(folder, job) as (opened, monitor):
@@ -215,9 +204,7 @@ def calibrate_lab(folder: LabFolder, job: Job) -> LabCalibration | None:
 def track(folder: LabFolder, show: Callable[[LiveRecording], AbstractContextManager[Sink]], job: Job) -> None:
     """Track robots with live cameras until the job is stopped (``ipsys live``).
 
-    Parameters
-    ----------
-    show : shows the dashboard of a recording; its value gets the recorded messages.
+    ``show`` shows the dashboard of a recording; its value gets the recorded messages.
     """
     fit = folder.fit()
     if fit is None:

@@ -12,6 +12,7 @@ import numpy as np
 
 from ipsys_log.app.report.json_format import plain
 from ipsys_log.app.report.rows import Rows, cm, counted, means_cm, mm, wrap_text
+from ipsys_log.plain_text import join_names
 from ipsys_log.units import CM_PER_M, MM_PER_M, NS_PER_S
 
 if TYPE_CHECKING:
@@ -70,10 +71,9 @@ def _dropped_lines(dropped: tuple[ExcludedSighting, ...], what: str) -> list[str
     lines = []
     for reason, count in counts.most_common():
         names = [drop.name for drop in dropped if drop.reason == reason]
-        shown = ", ".join(names[:3]) + (f" and {count - 3} more" if count > 3 else "")
         # The text of a reason is in the singular.
         text = re.sub("^is ", "are ", reason) if count > 1 else reason
-        lines.append(f"{what}: {shown}: {text}")
+        lines.append(f"{what}: {join_names(names, 3)}: {text}")
     more = len(lines) - _SHOWN_DROPPED
     return lines if more <= 1 else [*lines[:_SHOWN_DROPPED], f"{what}: {more} more reasons (see --json)"]
 

@@ -1,4 +1,4 @@
-"""Comparisons of estimates with the tracks of their robots, as text, as JSON and as figures."""
+"""Paths of other systems beside the tracks, as text and JSON: scored estimates, and imported ground truth."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -7,6 +7,7 @@ from typing import Any
 
 from ipsys_log.app.report.json_format import plain
 from ipsys_log.app.report.rows import Rows, cm, counted, percent, wrap_text
+from ipsys_log.exchange.import_truth import TEXTS, ImportedTruth
 from ipsys_log.messages import Run
 from ipsys_log.statistics.accuracy import root_mean_square_m
 from ipsys_log.statistics.estimate_scores import FIRST_POSE, NONE, SE3, SIM3, YAW, EstimateScore, ScoreRow
@@ -77,9 +78,7 @@ def _lines(found: Comparison) -> Iterator[str]:
 def alignment_lines(record: Run, what: str, bodies: Mapping[str, str]) -> Iterator[str]:
     """Yield the clock, the bodies and the frames in the record of a run, with their standard deviations.
 
-    Parameters
-    ----------
-    bodies : by the start of the names of its parameters, a text that tells a body from the others.
+    ``bodies`` has, by the start of the names of its parameters, a text that tells a body from the others.
     """
     offset = _value(record, "time_offset_s", 1, "s", 6) or "0 s"
     yield f"Time offset: {offset}, added to the times of {what}."
@@ -156,3 +155,47 @@ def _row_json(row: ScoreRow, turn: str) -> dict[str, Any]:
     pairs = {"3d": row.space, "2d": row.floor}
     found = {name: {**plain(one), "rmse_m": root_mean_square_m(one)} for name, one in pairs.items() if one}
     return {**found, **plain({f"{turn}_rmse_rad": row.rotation_rmse_rad})}
+
+
+def truth_lines(imported: ImportedTruth) -> Iterator[str]:
+    """Yield the estimates with their standard deviations, and the residuals, for a terminal."""
+    poses = ", ".join(f"{count} poses of {robot}" for robot, count in imported.poses.items())
+    yield wrap_text(f"Ground truth: {poses}.")
+    bodies = {f"{robot}_": f" of {robot}" for robot in imported.poses}
+    for line in alignment_lines(imported.record, "the file", bodies):
+        yield wrap_text(line)
+    if (residuals := imported.residuals) is not None:
+        count = residuals.outliers
+        outliers = f"; {counted(count, 'outlier')} not used for the estimate" if count else ""
+        yield wrap_text(
+            f"Residuals against run {imported.tracks_run}: RMSE {cm(residuals.rmse_2d_m)} cm on "
+            f"the floor, {cm(residuals.rmse_3d_m)} cm in 3D, at {residuals.instants} instants"
+            f"{outliers}."
+        )
+    if (found := imported.alignment) is not None:
+        for remark in found.remarks:
+            yield wrap_text(f"Remark: {remark}.")
+        what = "offset" if imported.record.parameters["align"] == "none" else "offset and alignment"
+        yield wrap_text(
+            f"Estimated from these tracks, {what} hide their constant errors: scores show the others only."
+        )
+
+
+def truth_json(imported: ImportedTruth) -> dict[str, Any]:
+    """Return the result as plain data, in SI units; the names are those of the record of the run."""
+    numbers = {
+        name: int(text) if text.isdigit() else float(text)
+        for name, text in imported.record.parameters.items()
+        if name not in TEXTS
+    }
+    summary: dict[str, Any] = {
+        "log": str(imported.path),
+        "run": imported.record.run,
+        "poses": imported.poses,
+        "align": imported.record.parameters["align"],
+    }
+    summary |= {
+        name: text for name, text in imported.record.parameters.items() if name in ("axes", "remarks")
+    }
+    compared = {} if imported.tracks_run is None else {"tracks_run": imported.tracks_run}
+    return summary | compared | numbers

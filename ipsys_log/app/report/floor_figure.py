@@ -246,11 +246,6 @@ def draw_session(session: Session, accuracies: Sequence[Accuracy], path: Path) -
     The left side shows the floor to scale: measured points, tracks and, if known, the ground truth. An arrow
     shows the error of the first model at each held-out point. The title states the factor of the arrows. The
     right side shows every error of every model and camera, in cm; it exists only with accuracies.
-
-    Raises
-    ------
-    IpsysError
-        The session has no floor, no measured points and no tracks.
     """
     scene = read_floor(session, accuracies)
     rows = count_rows(accuracies)

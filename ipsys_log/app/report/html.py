@@ -45,13 +45,7 @@ _MS_PER_S = 1e3
 
 
 def render_report(session: Session, accuracies: Sequence[Accuracy]) -> str:
-    """Render the page of a session; the same log always gives the same page.
-
-    Raises
-    ------
-    IpsysError
-        The session has calibration points, but no evaluated model.
-    """
+    """Render the page of a session; the same log always gives the same page."""
     findings = gather_findings(session, accuracies)
     if not findings.cameras and session.topics(MEASUREMENTS):
         raise IpsysError(

@@ -277,18 +277,7 @@ def _image_residuals(findings: Findings) -> dict[str, Figure]:
 def write_plots(findings: Findings, folder: Path, suffix: str = ".png") -> list[str]:
     """Write all tables and figures that have data into a folder: all files, or none.
 
-    Parameters
-    ----------
-    suffix : of the figures, which gives their format.
-
-    Returns
-    -------
-    The names of the files.
-
-    Raises
-    ------
-    IpsysError
-        No model was evaluated.
+    ``suffix`` gives the format of the figures.
     """
     files = {
         f"{name}.csv": make(findings) for name, (has_data, make) in _TABLES.items() if has_data(findings)

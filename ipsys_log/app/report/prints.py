@@ -167,13 +167,7 @@ class Page:
 
 
 def choose_paper(prints: Sequence[Print], name: str | None) -> Paper:
-    """Return the paper with a name; without a name, A4, or A3 if a print is too large for A4.
-
-    Raises
-    ------
-    IpsysError
-        The name is not known, or a print is too large; the text gives the largest size.
-    """
+    """Return the paper with a name; without a name, A4, or A3 if a print is too large for A4."""
     if name is not None and name.lower() not in PAPERS:
         raise IpsysError(f"--page {name}: is not known; give one of {', '.join(PAPERS)}")
     papers = [PAPERS["a4"], PAPERS["a3"]] if name is None else [PAPERS[name.lower()]]

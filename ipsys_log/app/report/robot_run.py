@@ -107,13 +107,7 @@ def _robot_json(robot: RobotResult, start_ns: int) -> dict[str, Any]:
 
 
 def render_robot_run(session: Session) -> tuple[str, bytes]:
-    """Return the HTML page of a robot run, and the PNG of its figure (figure 12 of the paper).
-
-    Raises
-    ------
-    IpsysError
-        The log has no robot run.
-    """
+    """Return the HTML page of a robot run, and the PNG of its figure (figure 12 of the paper)."""
     from ipsys_log.app.report.drive_figures import draw_drive, draw_panels, draw_paths
     from ipsys_log.app.report.figures import png, svg_data_uri
     from ipsys_log.app.report.html import render_page

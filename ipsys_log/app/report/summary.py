@@ -20,6 +20,7 @@ from ipsys_log.app.report.json_format import plain
 from ipsys_log.app.report.rows import cm, counted, name_cell, wrap_text
 from ipsys_log.messages import CameraEvaluation, ErrorStatistics
 from ipsys_log.models.table import reads_corners
+from ipsys_log.plain_text import join_names
 from ipsys_log.statistics.accuracy import CROSS_VALIDATION, POOLED, root_mean_square_m
 from ipsys_log.statistics.consistency import FEWEST_POINTS
 from ipsys_log.statistics.ground_truth import pool_trajectories
@@ -99,8 +100,7 @@ def _excluded_line(best: Accuracy, row: CameraEvaluation, space: bool) -> str:
     """Return the gross outliers without which the figures are computed, and the error with them."""
     assert best.evaluation is not None
     names = [name_cell(suspect.measurement).plain for suspect in best.evaluation.excluded]
-    listed = ", ".join(names[:_NAMED]) + (f" and {len(names) - _NAMED} more" if len(names) > _NAMED else "")
-    one = len(names) == 1
+    one, listed = len(names) == 1, join_names(names, _NAMED)
     of = f"the gross outlier {listed}" if one else f"{len(names)} gross outliers: {listed}"
     text = f"The errors and the advice are without {of}."
     whole = overall_row_with_excluded(best, row.scheme == CROSS_VALIDATION)

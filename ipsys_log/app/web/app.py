@@ -158,9 +158,7 @@ _KEPT = 30
 def build_app(scene: MeasuringScene, setup: str | None = None) -> Starlette:
     """Return the page of a scene, without a guard; its requests are under ``/api``.
 
-    Parameters
-    ----------
-    setup : the address of the setup page that shows this page; None: there is none.
+    ``setup`` is the address of the setup page that shows this page; None: there is none.
     """
     questions = _Questions(scene, setup)
     return Starlette(

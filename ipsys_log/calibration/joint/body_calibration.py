@@ -1,7 +1,5 @@
 """Calibration of a rigid body: the poses and sides of its markers, from frames that show several of them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -15,13 +13,7 @@ from ipsys_log.calibration.joint.body_frames import (
     read_frames,
     spread_frames,
 )
-from ipsys_log.calibration.joint.body_problem import (
-    MARKER,
-    PRINT_SIGMA,
-    SIDE_SIGMA,
-    BodyProblem,
-    BodyState,
-)
+from ipsys_log.calibration.joint.body_problem import MARKER, PRINT_SIGMA, SIDE_SIGMA, BodyProblem, BodyState
 from ipsys_log.calibration.joint.locate_bodies import angles_between
 from ipsys_log.calibration.joint.model import JointModel
 from ipsys_log.errors import IpsysError

@@ -1,7 +1,5 @@
 """The least squares of a carried body: its poses in all frames, and the poses and sides of its markers."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """Observations of a carried body or board from a log, and known poses of stationary markers."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 
@@ -111,11 +109,6 @@ def gather_board(
     lenses, nominal : as for :func:`gather_carried`.
     sightings : by camera, times in ns and the corners of the board in the frames at these times.
     board : the board.
-
-    Raises
-    ------
-    IpsysError
-        A camera has no intrinsics.
     """
     missing = sorted(set(sightings) - set(lenses))
     if missing:

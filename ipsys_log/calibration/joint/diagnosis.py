@@ -1,7 +1,5 @@
 """Faults in the observations of a joint fit: wrong readings, wrong markers, moved cameras."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

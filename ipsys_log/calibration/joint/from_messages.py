@@ -1,7 +1,5 @@
 """Observations for the joint calibration from the messages of a log."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -77,7 +75,6 @@ def gather_observations(
     markers: Mapping[str, Iterable[Markers]],
     measurements: Sequence[Measurement],
     nominal: Collection[str] = (),
-    settings: JointSettings | None = None,
     with_drives: bool = True,
     baselines: Sequence[Measurement] = (),
 ) -> Observations:
@@ -94,7 +91,6 @@ def gather_observations(
     markers : detections by camera.
     measurements : the valid measurements, without withdrawals.
     nominal : cameras whose intrinsics are nominal, and not from a chessboard.
-    settings : prior standard deviations; None: the defaults.
     with_drives : whether to use the sightings of moving robots.
     baselines : the valid readings of distances between reference points. They count if the rig says that
         another instrument has measured these points.
@@ -104,7 +100,6 @@ def gather_observations(
     FitError
         A camera has no calibration, or a measurement names an unknown reference point.
     """
-    settings = settings or JointSettings()
     missing = sorted(set(markers) - set(calibrations))
     if missing:
         raise FitError(f"camera {missing[0]}: the log has no calibration for it; add one with --calibration")
@@ -115,7 +110,7 @@ def gather_observations(
         seen = {marker_id for own in tracks.values() for marker_id in own}
         robots = {marker_id for marker_id in seen if rig.knows(marker_id) and rig.height_of(marker_id)}
         ids = sorted({*ids, *robots})
-    bodies = tuple(_body(rig, marker_id, settings) for marker_id in ids)
+    bodies = tuple(_body(rig, marker_id) for marker_id in ids)
     points = tuple(_point(one, rig, ids.index(one.marker_id)) for one in valid if one.marker_id is not None)
     epoch_ns = min((int(track.times_ns[0]) for own in tracks.values() for track in own.values()), default=0)
     sightings = []
@@ -185,7 +180,8 @@ def _track(rows: list[tuple[int, Array, Array | None]]) -> _Track:
     )
 
 
-def _body(rig: Rig, marker_id: int, settings: JointSettings) -> Body:
+def _body(rig: Rig, marker_id: int) -> Body:
+    settings = JointSettings()
     return marker_body(
         str(marker_id),
         rig.length_of(marker_id),
@@ -259,11 +255,7 @@ def _stationary(
 
 
 def _moving(
-    tracks: Mapping[int, _Track],
-    measurements: Sequence[Measurement],
-    ids: list[int],
-    rig: Rig,
-    epoch_ns: int,
+    tracks: Mapping[int, _Track], measurements: Sequence[Measurement], ids: list[int], rig: Rig, epoch_ns: int
 ) -> list[_Row]:
     """Return the sightings of markers on robots, at most one in each interval of time."""
     rows = []

@@ -3,8 +3,6 @@
 Nothing is known of the world: the first camera is its origin, and the body gives the scale.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -86,9 +84,7 @@ def fit_path(cameras: JointFit, observations: Observations, step_s: float) -> Jo
     problem, state = _build(observations, cameras.settings, poses, views, step_s)
     layout = replace(known, mean=cameras.state.values, sigma=np.zeros(len(known.sigma)))
     state = replace(state, values=cameras.state.values)
-    return _solve(
-        observations, cameras.settings, replace(problem, layout=layout), state, lambda step, cost: None
-    )
+    return _solve(observations, cameras.settings, replace(problem, layout=layout), state)
 
 
 def _solve(
@@ -96,7 +92,7 @@ def _solve(
     settings: JointSettings,
     problem: Problem,
     state: State,
-    progress: Callable[[int, float], None],
+    progress: Callable[[int, float], None] = lambda step, cost: None,
 ) -> JointFit:
     """Solve with the noise of the frames' times, which acts on the corners by the velocity of the body."""
     if len(problem.trajectories.free_paths) and settings.stamp_jitter_s:
@@ -135,7 +131,7 @@ def _sharing(sightings: Sightings) -> Array:
     return np.asarray(np.sqrt(counts))
 
 
-def fit_motion(fit: JointFit, progress: Callable[[int, float], None] = lambda step, cost: None) -> JointFit:
+def fit_motion(fit: JointFit) -> JointFit:
     """Return the fit with the jerk of the body and the jitter of the stamps that the frames show.
 
     Both are standard deviations before the fit. Those are taken for which the observations are most likely,
@@ -149,16 +145,14 @@ def fit_motion(fit: JointFit, progress: Callable[[int, float], None] = lambda st
     best = fit
     for names in (("jerk_density", "turn_jerk_density"), ("stamp_jitter_s",)) * 2:
         for factor in (_FACTOR, 1 / _FACTOR):
-            while (trial := _with_factor(best, names, factor, progress)) is not None:
+            while (trial := _with_factor(best, names, factor)) is not None:
                 if _improbability(trial) > _improbability(best) - _CLEARLY:
                     break
                 best = trial
     return best
 
 
-def _with_factor(
-    fit: JointFit, names: Sequence[str], factor: float, progress: Callable[[int, float], None]
-) -> JointFit | None:
+def _with_factor(fit: JointFit, names: Sequence[str], factor: float) -> JointFit | None:
     """Return the fit with some settings times a factor; None beyond their limits, or without a result."""
     changed = {name: getattr(fit.settings, name) * factor for name in names}
     if not all(_LIMITS[name][0] <= value <= _LIMITS[name][1] for name, value in changed.items()):
@@ -167,7 +161,7 @@ def _with_factor(
     densities = {name: getattr(settings, name) for name in ("jerk_density", "turn_jerk_density")}
     problem = replace(fit.problem, trajectories=replace(fit.problem.trajectories, **densities))
     try:
-        return _solve(fit.observations, settings, problem, fit.state, progress)
+        return _solve(fit.observations, settings, problem, fit.state)
     except FitError:
         return None
 

@@ -1,7 +1,5 @@
 """Start of the fit of a hand-held body: its poses in single frames, the cameras to each other, its path."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -151,10 +149,7 @@ def start_path(
         for pose, number in zip(poses, numbers.tolist(), strict=True)
     ]
     trajectories = Trajectories(
-        0,
-        free_paths=paths,
-        jerk_density=settings.jerk_density,
-        turn_jerk_density=settings.turn_jerk_density,
+        0, free_paths=paths, jerk_density=settings.jerk_density, turn_jerk_density=settings.turn_jerk_density
     )
     sigmas = np.repeat([_POSE_M, _POSE_RAD], 3)
     places = np.concatenate([poses[:, :3, 3], np.array(turned)], axis=1)

@@ -1,7 +1,5 @@
 """Errors of cameras that a hand-held body has calibrated: in held-out frames, and of distances on a board."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace

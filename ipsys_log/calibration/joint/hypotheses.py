@@ -4,8 +4,6 @@ A plain fit believes its inputs. If its readings or its sightings contradict it,
 are compared before anything is called an outlier.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Coordinates of a lab for cameras that are known to each other: from stationary markers with known poses."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -133,7 +131,7 @@ class _Pose:
             wanted = turn_about_z(float(heading_rad))
         misses[3:] = Rotation.from_matrix(own @ wanted.T).as_rotvec()
         slopes = np.zeros((_POSE, _POSE))
-        slopes[:3, :3] = turn.T @ skew_matrices(arm_m[None])[0]
+        slopes[:3, :3] = turn.T @ skew_matrices(arm_m)
         slopes[:3, 3:], slopes[3:, :3] = -turn.T, -turn.T
         seen = np.isfinite(known.sigmas)
         into = self.into_lab(turn)
@@ -189,7 +187,7 @@ def apply_frame(
         values[place] = frame.turn.T @ arm_m
         across[place, place] = frame.turn.T
         by_frame[turn, :3] = before
-        by_frame[place, :3] = frame.turn.T @ skew_matrices(arm_m[None])[0]
+        by_frame[place, :3] = frame.turn.T @ skew_matrices(arm_m)
         by_frame[place, 3:] = -frame.turn.T
         by_scale[place] = values[place] - middle_m
     across = across + by_frame @ frame.slopes

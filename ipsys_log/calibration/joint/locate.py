@@ -3,8 +3,6 @@
 The residuals and derivatives of the corners also serve other estimates.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -79,10 +77,6 @@ def locate_markers(
     lengths_m : (n,), nominal sides of the markers.
     height_sigmas_m : standard deviation of the heights: a number, or (n,).
     tilt_sigma_rad : standard deviation of the tilt about either axis.
-
-    Returns
-    -------
-    LevelPositions : those of the markers.
     """
     inward = edge_motion(corners_px)
     points_m, headings_rad, floor_slopes, floor_modes = start_level(model, corners_px, inward, heights_m)

@@ -1,7 +1,5 @@
 """Full poses of rigid bodies from the corners of all their markers in one frame, by a joint model."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -220,7 +218,7 @@ def corner_motion(arms_m: Array, times_s: Array, at_one_instant: bool) -> Array:
     ``times_s`` (..., 4) and ``at_one_instant``, see :class:`BodySightings`.
     """
     times_s = times_s[..., None, None]
-    moved = np.concatenate([np.broadcast_to(np.eye(3), (*arms_m.shape, 3)), -_skew(arms_m)], axis=-1)
+    moved = np.concatenate([np.broadcast_to(np.eye(3), (*arms_m.shape, 3)), -skew_matrices(arms_m)], axis=-1)
     if not at_one_instant:
         return np.asarray(times_s * moved)
     # The motion at the mean time of the marker, and that out of its plane from there to the row.
@@ -228,8 +226,9 @@ def corner_motion(arms_m: Array, times_s: Array, at_one_instant: bool) -> Array:
     normal = cross(arms_m[..., 1, :] - arms_m[..., 0, :], arms_m[..., 0, :] - arms_m[..., 3, :])
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
     out = normal[..., None, :, None] * normal[..., None, None, :]
-    tilt = -_skew(arms_m - middle_m) @ (np.eye(3) - out)
-    out_of_plane = np.concatenate([np.broadcast_to(out, tilt.shape), -out @ _skew(middle_m) + tilt], axis=-1)
+    tilt = -skew_matrices(arms_m - middle_m) @ (np.eye(3) - out)
+    along = np.broadcast_to(out, tilt.shape)
+    out_of_plane = np.concatenate([along, -out @ skew_matrices(middle_m) + tilt], axis=-1)
     middle_s = times_s.mean(axis=-3, keepdims=True)
     return np.asarray(middle_s * moved + (times_s - middle_s) * out_of_plane)
 
@@ -240,11 +239,6 @@ def _step(now: _Look, variances: Array) -> tuple[Array, Array, Array]:
     covariances = np.asarray(np.linalg.inv(across @ now.by_pose), dtype=np.float64)
     gains = covariances @ across
     return (gains @ now.residuals[:, :, None])[:, :, 0], covariances, gains
-
-
-def _skew(vectors: Array) -> Array:
-    """Return the matrices (..., 3, 3) of the cross product with vectors (..., 3)."""
-    return skew_matrices(vectors.reshape(-1, 3)).reshape(*vectors.shape, 3)
 
 
 def _choose(better: Mask, tried: _Look, now: _Look) -> _Look:

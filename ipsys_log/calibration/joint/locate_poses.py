@@ -1,7 +1,5 @@
 """Full poses of markers from their corners, by a joint model, if heights are unknown or tops are tilted."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

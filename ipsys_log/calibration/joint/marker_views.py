@@ -1,7 +1,5 @@
 """Poses of single markers in level camera coordinates: the raw material of the start of the fit."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

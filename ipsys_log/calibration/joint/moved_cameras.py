@@ -4,8 +4,6 @@ All residuals count with their squares. The robust loss of a contradicted fit ma
 sightings that show the contradiction.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 

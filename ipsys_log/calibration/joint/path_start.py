@@ -1,7 +1,5 @@
 """Paths of robots from sightings of their markers: their parts, their knots, and a first fit."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -168,12 +166,7 @@ def cover_times(times_s: Array, step_s: float) -> Paths:
 
 
 def smooth_knots(
-    paths: Paths,
-    numbers: Indices,
-    times_s: Array,
-    places: Array,
-    sigmas: Array,
-    trajectories: Trajectories,
+    paths: Paths, numbers: Indices, times_s: Array, places: Array, sigmas: Array, trajectories: Trajectories
 ) -> Array:
     """Return knots (k, d) of paths through places, robust against wrong ones.
 

@@ -3,8 +3,6 @@
 A model can get new poses of moved cameras without a new fit.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -64,13 +62,7 @@ def _parameters(arrays: Mapping[str, Array]) -> tuple[Parameter, ...]:
 
 
 def restore_joint(payload: Model) -> dict[str, JointModel]:
-    """Return the joint model of each camera from a payload, by the name of the camera.
-
-    Raises
-    ------
-    IpsysError
-        A parameter is missing, or has the wrong shape.
-    """
+    """Return the joint model of each camera from a payload, by the name of the camera."""
     return {camera.camera: _restore(camera, payload.shared) for camera in payload.cameras}
 
 
@@ -92,11 +84,6 @@ def mend_poses(model: Model, changes: Mapping[str, PoseChange], time_ns: int) ->
     model : the joint model before the motions.
     changes : motions by camera; a camera that is not in the model has no effect.
     time_ns : time of the new model.
-
-    Raises
-    ------
-    IpsysError
-        The model is not complete.
     """
     joints = {
         name: move_camera(joint, changes[name].motion) if name in changes else joint

@@ -1,7 +1,5 @@
 """Factors of calibration points: tape distances, heights, given world points, and tilts."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Standard deviations of priors from the observations: unevenness of the floor, and scale of the tape."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -24,9 +22,7 @@ def widen_tape(layout: Layout, state: State, covariance: Array) -> Layout:
     The readings show that tape and reference points disagree, but not which of them is wrong. So both get the
     same factor, of at least 1: their covariance then covers the contradiction.
 
-    Parameters
-    ----------
-    layout, state, covariance : of a fit; ``covariance`` (g, g) is that of the global unknowns.
+    The layout, the state and the covariance (g, g) of the global unknowns are those of a fit.
     """
     columns = _free(layout)
     if not len(columns):

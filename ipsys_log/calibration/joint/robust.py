@@ -1,7 +1,5 @@
 """Robust loss of the joint calibration: squares for normal errors, a logarithm for outliers."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from ipsys_log.messages import Array

@@ -1,7 +1,5 @@
 """Settings of the joint calibration: standard deviations of what is known before the fit."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

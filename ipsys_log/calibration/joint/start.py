@@ -1,7 +1,5 @@
 """Start of the joint fit: camera poses and places of markers, from single markers and the tape."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -4,8 +4,6 @@ The cameras alone give the shape of all calibration points, up to a motion over 
 such a motion, and says for each point which mistake makes its readings fit. The most probable one counts.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations

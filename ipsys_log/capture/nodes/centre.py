@@ -65,11 +65,6 @@ def is_of_node(camera: RigCamera) -> bool:
 def node_of(camera: RigCamera) -> str:
     """Return the name of the node of a camera.
 
-    Raises
-    ------
-    IpsysError
-        The name is not valid.
-
     Examples
     --------
     >>> node_of(RigCamera("red", source="zenoh:red"))
@@ -196,13 +191,7 @@ class _Link:
         self._subscriber = session.declare_subscriber(wire.frames_key(node), _directly(self._receive))
 
     def await_node(self, network: NodeNetwork, say: Say) -> Iterator[None]:
-        """Yield None until the node has answered; ``say`` reports a longer wait.
-
-        Raises
-        ------
-        SourceError
-            No node answers.
-        """
+        """Yield None until the node has answered; ``say`` reports a longer wait."""
         start_ns = self.heard_ns = self._clock.now_ns()
         is_said, is_first = False, not self._stream.is_known
         while not (self._exchanges >= _OPENING_EXCHANGES and self._stream.is_known):

@@ -196,13 +196,7 @@ class NodeNetwork:
         return f"{'tcp' if self.certificates is None else 'tls'}/{host}:{self.port}"
 
     def files_of(self, name: str) -> Certificates | None:
-        """Return the certificates of a host; None without certificates.
-
-        Raises
-        ------
-        IpsysError
-            A file is missing or not valid.
-        """
+        """Return the certificates of a host; None without certificates."""
         if self.certificates is None:
             return None
         files = Certificates.in_folder(self.certificates, name)
@@ -220,11 +214,6 @@ def read_network(
     nodes : the table ``[nodes]`` of the rig; None: its defaults.
     folder : the folder of the rig file.
     centre, certificates : replace the values of the rig.
-
-    Raises
-    ------
-    IpsysError
-        The address has another form, or it is that of another machine and there are no certificates.
 
     Examples
     --------
@@ -276,13 +265,7 @@ def open_centre_session(network: NodeNetwork, cameras: Sequence[str]) -> zenoh.S
 
 
 def open_node_session(network: NodeNetwork, camera: str) -> zenoh.Session:
-    """Open the session of the node of a camera; it connects to the centre as soon as the centre answers.
-
-    Raises
-    ------
-    IpsysError
-        A certificate is missing or not valid.
-    """
+    """Open the session of the node of a camera; it connects to the centre as soon as the centre answers."""
     files = network.files_of(camera)
     settings = {
         "listen/endpoints": [],

@@ -154,9 +154,7 @@ class Node:
 
         A centre that refuses this node asks, too, but not for its session.
 
-        Parameters
-        ----------
-        has_ended : the source has ended; otherwise the node was stopped, and may start again.
+        If the source has not ended (``has_ended``), the node was stopped, and may start again.
         """
         self._has_ended = has_ended
         start_ns = self._clock.now_ns()
@@ -174,9 +172,7 @@ class Node:
     def describe_missing(self, count: int, log: Path) -> str:
         """Return a line about the frames, or their markers, that the centre does not have.
 
-        Parameters
-        ----------
-        log : the present path of the log, which may have been renamed.
+        ``log`` is the present path of the log, which may have been renamed.
         """
         missing = f"{count} frames" if self._sent[0] is not Markers else f"the markers of {count} frames"
         return f"the centre {self._network} does not have {missing} of camera {self._camera}; {log} has all"

@@ -263,12 +263,7 @@ class NodeStream:
             # again.
             time_ns -= mid_exposure_ns(0, self._camera)
         return Frame(
-            data,
-            header.format,
-            time_ns,
-            received_ns=now_ns,
-            session=header.session,
-            number=header.number,
+            data, header.format, time_ns, received_ns=now_ns, session=header.session, number=header.number
         )
 
     def _is_plausible(self, frame: Frame, now_ns: int) -> bool:
@@ -311,14 +306,7 @@ class NodeStream:
         if line is not None:
             name, session = self._camera.name, self._session
             payload = ClockEstimate(
-                now_ns,
-                name,
-                session,
-                line.node_ns,
-                line.offset_ns,
-                line.drift,
-                line.bound_ns,
-                line.exchanges,
+                now_ns, name, session, line.node_ns, line.offset_ns, line.drift, line.bound_ns, line.exchanges
             )
             yield SourceMessage(clock_topic(name), payload)
 

@@ -95,11 +95,6 @@ def plan_points(settings: LabSettings, cameras: Sequence[Camera]) -> list[tuple[
     """Return sets of calibration points, one for each marker, until every camera sees enough of them.
 
     The required number for each camera is about ``settings.points``.
-
-    Raises
-    ------
-    IpsysError
-        The floor has no room for another marker.
     """
     rng = random_stream(settings.seed, Purpose.PLACES)
     seen: dict[str, list[SimulatedPose]] = {camera.name: [] for camera in cameras}
@@ -199,13 +194,7 @@ def choose_place(
     before: Sequence[SimulatedPose],
     suits: Callable[[SimulatedPose, Camera, LabSettings], bool] = lambda where, camera, settings: True,
 ) -> SimulatedPose:
-    """Choose a pose in a camera's field of view, far from poses ``before``, without overlap with ``taken``.
-
-    Raises
-    ------
-    IpsysError
-        The field of view has no room for the marker.
-    """
+    """Choose a pose in a camera's field of view, far from poses ``before``, not overlapping ``taken``."""
     candidates: list[SimulatedPose] = []
     for _ in range(_DRAWS):
         x_m, y_m = rng.uniform(0, settings.floor_m, 2)

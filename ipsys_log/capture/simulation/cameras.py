@@ -46,11 +46,6 @@ class Camera:
 def mount_cameras(settings: LabSettings, time_ns: int = 0) -> tuple[Camera, ...]:
     """Return the cameras in a row above the middle of the floor, or in the grid of a hall.
 
-    Parameters
-    ----------
-    settings : settings of the lab.
-    time_ns : time of the calibrations.
-
     Raises
     ------
     IpsysError

@@ -56,8 +56,7 @@ class Instant:
 
 
 def simulate(
-    settings: LabSettings,
-    progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
+    settings: LabSettings, progress: Callable[[str, int, int], None] = lambda stage, done, total: None
 ) -> Iterator[Message]:
     """Yield the messages of a session of the simulated lab, in log order.
 
@@ -76,11 +75,6 @@ def simulate(
         The rig; a calibration per camera; then, per instant, the ground truth, a frame per camera and the
         measurements. ``publish_time_ns`` is the time of the instant. For a frame, it is the middle of the
         exposure of its first row.
-
-    Raises
-    ------
-    IpsysError
-        The settings contradict one another.
 
     Examples
     --------

@@ -185,11 +185,6 @@ def plan_live_lab(settings: LabSettings) -> LiveLab:
     ----------
     settings : settings of the lab. All determine the poses, except size, rate and quality of the images.
 
-    Raises
-    ------
-    IpsysError
-        The lab has no room for so many markers.
-
     Examples
     --------
     >>> lab = plan_live_lab(LabSettings(stations=4, markers=2, drive_s=2.0))

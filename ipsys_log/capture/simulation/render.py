@@ -297,9 +297,7 @@ def render(
 def expose(view: FloorView, placed: Sequence[Print], settings: LabSettings) -> Plane:
     """Return the grey levels of an image before noise and rounding, (height, width).
 
-    Parameters
-    ----------
-    view, placed, settings : as for :func:`render`.
+    The arguments are those of :func:`render`.
     """
     return _compose(view, placed, settings)[0]
 

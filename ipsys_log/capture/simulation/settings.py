@@ -191,13 +191,7 @@ class LabSettings:
 
 
 def read_settings(file: Path | None, changes: Iterable[str]) -> dict[str, Any]:
-    """Read settings of `LabSettings` by name, from a TOML file and then from texts such as ``stations=25``.
-
-    Raises
-    ------
-    IpsysError
-        The file or a text is not TOML, has no such setting, or a value of another type.
-    """
+    """Read settings of `LabSettings` by name, from a TOML file, then from texts such as ``stations=25``."""
     given: dict[str, Any] = {}
     texts = [] if file is None else [(str(file), file.read_bytes())]
     texts += [(f"--set {change}", change.encode()) for change in changes]
@@ -226,11 +220,6 @@ def _typed(table: dict[str, Any], where: str) -> Iterator[tuple[str, Any]]:
 
 def parse_grid(text: str) -> tuple[int, int]:
     """Return the columns and rows of a grid of cameras from text such as ``6x4``.
-
-    Raises
-    ------
-    IpsysError
-        The text is not a grid, or the grid is too large.
 
     Examples
     --------
@@ -261,11 +250,6 @@ def grid_names(columns: int, rows: int) -> tuple[str, ...]:
 
 def hall_settings(columns: int, rows: int, **settings: Any) -> LabSettings:
     """Return the settings of a hall; ``settings`` are other settings of the lab.
-
-    Raises
-    ------
-    IpsysError
-        A value is impossible for a lab.
 
     Examples
     --------

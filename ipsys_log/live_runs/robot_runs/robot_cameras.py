@@ -95,9 +95,7 @@ class RobotCameras:
 class Driver:
     """The thread that sends ticks to the robots in real time, and writes their commands. A context manager.
 
-    Attributes
-    ----------
-    fault : the error that ended the run, such as a program that has ended.
+    ``fault`` is the error that ended the run, such as a program that has ended.
     """
 
     def __init__(self, run: RobotRun, cameras: LiveCameras, steering: Steering) -> None:

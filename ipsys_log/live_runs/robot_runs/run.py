@@ -50,10 +50,6 @@ def drive_robots(
     say : called with lines about the robots and cameras.
     begin : called before the drive with a function that ends it in order.
 
-    Returns
-    -------
-    One outcome for each stage, as from :func:`ipsys_log.live_runs.pipeline.live`.
-
     Raises
     ------
     IpsysError

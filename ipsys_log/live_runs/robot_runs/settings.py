@@ -54,11 +54,6 @@ def find_ports(first: int, robots: int, has_server: bool, has_relay: bool) -> Po
     robots : number of robots.
     has_server : all robots connect to one server, or to their relay.
     has_relay : each robot has a relay.
-
-    Raises
-    ------
-    IpsysError
-        A port is in use.
     """
     own = 0 if has_server and not has_relay else robots
     count = has_server + own + (robots if has_relay else 0)
@@ -160,13 +155,7 @@ class RobotRun:
         return self.over != "udp"
 
     def check(self) -> None:
-        """Check all settings.
-
-        Raises
-        ------
-        IpsysError
-            A setting is impossible, or a port is in use.
-        """
+        """Check all settings."""
         if not self.program.is_file():
             raise IpsysError(
                 f"--program {self.program}: does not exist; name the program of the robots, or leave "
@@ -228,23 +217,12 @@ class RobotRun:
         ]
 
     def ports(self) -> Ports:
-        """Return ports of loopback that are free now.
-
-        Raises
-        ------
-        IpsysError
-            A port is in use.
-        """
+        """Return ports of loopback that are free now."""
         return find_ports(self.port, len(self.paths), self.over != "udp", self.has_relay)
 
 
 def choose_paths(count: int, given: Sequence[str] = ()) -> dict[str, tuple[Waypoint, ...]]:
     """Return the paths of ``count`` robots, with those of the user: ``robot_0=0.5,0.5 0.5,2.5``.
-
-    Raises
-    ------
-    IpsysError
-        A path names no such robot, or is not valid.
 
     Examples
     --------
@@ -277,13 +255,7 @@ def _waypoint(text: str) -> Waypoint:
 
 
 def parse_failure(text: str) -> CameraFailure:
-    """Return the failure of a camera: ``white=20:5`` fails at 20 s, for 5 s.
-
-    Raises
-    ------
-    IpsysError
-        The text has another form.
-    """
+    """Return the failure of a camera: ``white=20:5`` fails at 20 s, for 5 s."""
     match = re.fullmatch(r"([a-z][a-z0-9_]*)=(\d+(?:\.\d+)?):(\d+(?:\.\d+)?)", text)
     if match is None:
         raise IpsysError(f"--fail {text}: write CAMERA=START:SECONDS, such as white=20:5")
@@ -294,13 +266,7 @@ def parse_failure(text: str) -> CameraFailure:
 
 
 def read_lab(log: LogLocation, lab: LabSettings) -> LabSettings:
-    """Return the settings of the simulated lab of a calibrated log, with its image size.
-
-    Raises
-    ------
-    IpsysError
-        The log is not of this lab: its camera intrinsics are missing or differ.
-    """
+    """Return the settings of the simulated lab of a calibrated log, with its image size."""
     with Session([log]) as session:
         lenses: dict[str, CameraCalibration] = {
             name: session.payloads([topic])[-1] for name, topic in session.calibrations.items()

@@ -27,27 +27,14 @@ _LOOPBACK = "127.0.0.1"
 
 
 class Programs(NamedTuple):
-    """The running programs of the robots.
-
-    Attributes
-    ----------
-    path : the file of the program.
-    processes : by robot.
-    relays : the relays by robot; empty without relays.
-    """
+    """The running programs of the robots."""
 
     path: Path
     processes: Mapping[str, subprocess.Popen[bytes]]
     relays: "Mapping[str, RelayLink]"
 
     def check(self) -> None:
-        """Check that all programs still run.
-
-        Raises
-        ------
-        IpsysError
-            A program has ended.
-        """
+        """Check that all programs still run."""
         for robot, process in self.processes.items():
             if process.poll() is not None:
                 raise IpsysError(
@@ -68,13 +55,7 @@ class RelayLink:
         self._socket.close()
 
     def tick(self, number: int, time_ns: int, positions: int) -> int:
-        """Send the time, and the number of positions so far; return the number that the relay has sent on.
-
-        Raises
-        ------
-        IpsysError
-            The relay has ended or does not answer.
-        """
+        """Send the time, and the number of positions so far; return the number that the relay has sent on."""
         fields = {"relay_tick": number, "time_ns": time_ns, "positions": positions}
         self._socket.sendto(json.dumps(fields).encode(), self._address)
         # In turns: time in which this program is suspended does not count.
@@ -90,12 +71,7 @@ class RelayLink:
 
 @contextmanager
 def start_programs(run: RobotRun, wheels: str, ports: Ports) -> Iterator[Programs]:
-    """Start a program for each robot, and a relay if the run has one; they end after the block.
-
-    Parameters
-    ----------
-    wheels : the address of the wheels.
-    """
+    """Start a program for each robot, and a relay if the run has one; they end after the block."""
     with ExitStack() as stack:
         relays: dict[str, RelayLink] = {}
         processes: dict[str, subprocess.Popen[bytes]] = {}
@@ -218,9 +194,7 @@ class Steering:
     def tick_and_wait(self, sent: Counter[str]) -> list[WheelCommand]:
         """Send the next tick, wait for the commands of all robots, and carry them out.
 
-        Parameters
-        ----------
-        sent : by robot, the number of positions that were sent so far.
+        ``sent`` has, by robot, the number of positions that were sent so far.
         """
         time_ns = self.next_ns
         self._number += 1

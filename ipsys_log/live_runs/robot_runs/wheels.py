@@ -108,13 +108,7 @@ class Wheels:
         self._is_stopped = True
 
     def wait_for_robots(self) -> None:
-        """Wait until the program of each robot has sent its name.
-
-        Raises
-        ------
-        IpsysError
-            A program has ended, or did not send its name.
-        """
+        """Wait until the program of each robot has sent its name."""
         patience = _Patience(self._clock, self._check, self._say)
         while missing := [name for name in self._robots if name not in self._addresses]:
             patience.take_turn(missing[0], f'{{"robot": "{missing[0]}"}} to {self.address}')
@@ -138,11 +132,6 @@ class Wheels:
         """Wait for the answers of all robots to a tick; return them in the order of the robots.
 
         After :meth:`stop`, none are returned.
-
-        Raises
-        ------
-        IpsysError
-            A program has ended, or does not answer.
         """
         commands: dict[str, WheelCommand] = {}
         patience = _Patience(self._clock, self._check, self._say)

@@ -81,13 +81,7 @@ def free_id(history: Iterable[Measurement], name: str) -> str:
 
 
 def withdrawal_of(history: Sequence[Measurement], name: str, reason: str | None = None) -> Measurement:
-    """Return the message that withdraws a measurement, perhaps with the reason; the log keeps it.
-
-    Raises
-    ------
-    IpsysError
-        No measurement has this id, or it is withdrawn already.
-    """
+    """Return the message that withdraws a measurement, perhaps with the reason; the log keeps it."""
     # A faulty measurement can be withdrawn, too.
     named = [one for one in history if one.refers_to is None and one.id == name]
     if named and name not in withdrawals(history):
@@ -285,11 +279,6 @@ def needs_baseline(rig: Rig, history: Sequence[Measurement]) -> bool:
 
 def read_baseline(text: str, rig: Rig, history: Sequence[Measurement], time_ns: int) -> Measurement:
     """Return the measurement of a typed distance AB in cm.
-
-    Raises
-    ------
-    IpsysError
-        The text is not a number, or contradicts the reference points of the rig.
 
     Examples
     --------

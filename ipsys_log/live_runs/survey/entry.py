@@ -68,13 +68,7 @@ class Entry:
 
 
 def check_references(rig: Rig) -> None:
-    """Check that the rig has enough reference points for tape measurements.
-
-    Raises
-    ------
-    IpsysError
-        The rig has fewer than two reference points.
-    """
+    """Check that the rig has enough reference points for tape measurements."""
     count = len(rig.reference_points)
     if count < 2:
         present = (

@@ -107,11 +107,6 @@ def plan_floor(
     count : number of points to plan.
     heights_m : possible heights of a marker; empty for the heights that were used so far.
     progress : called after each point.
-
-    Raises
-    ------
-    IpsysError
-        No camera sees a marker of these heights anywhere on the floor.
     """
     model: Model = session.payloads(session.topics(MODEL, run))[-1]
     if reads_corners(model.name):

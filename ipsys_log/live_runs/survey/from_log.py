@@ -30,6 +30,7 @@ from ipsys_log.messages import (
     Rig,
 )
 from ipsys_log.messages.channels import CAMERA_POINTS, MARKERS, MEASUREMENTS, MODEL, RIG, Channel
+from ipsys_log.plain_text import join_names
 from ipsys_log.statistics.calibration_points import TimedPoints, gather_sightings, withdrawals
 from ipsys_log.statistics.stationary import stationary_intervals
 from ipsys_log.units import NS_PER_S
@@ -321,13 +322,7 @@ def _readmission_of(history: Sequence[Measurement], point: Measurement, reason: 
 
 
 def _chosen_ids(path: Path, points: dict[str, Measurement], names: Sequence[str]) -> list[str]:
-    """Return the ids of the named measurements, each once, in the order of the names.
-
-    Raises
-    ------
-    IpsysError
-        A name is neither an id nor a calibration point; the text lists the names of the log.
-    """
+    """Return the ids of the named measurements, each once, in the order of the names."""
     chosen: dict[str, None] = {}
     for name in names:
         ids = [key for key, point in points.items() if name in (key, point.calibration_point)]
@@ -339,5 +334,4 @@ def _chosen_ids(path: Path, points: dict[str, Measurement], names: Sequence[str]
 
 def _listed(points: dict[str, Measurement]) -> str:
     names = list(dict.fromkeys(point.calibration_point or key for key, point in points.items()))
-    more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
-    return (", ".join(names[:_MOST_NAMES]) or "none") + more
+    return join_names(names, _MOST_NAMES) or "none"

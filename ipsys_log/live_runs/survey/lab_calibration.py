@@ -175,11 +175,6 @@ def describe_lab(
     train : label of the measurements of the fit.
     goal_m : wanted mean error of every camera.
     progress : called with the steps of the fit.
-
-    Raises
-    ------
-    IpsysError
-        No camera sees the floor.
     """
     view = LogView(session, _inputs(session, run), *given)
     points = [point.measurement for point in measured(view)]

@@ -110,13 +110,7 @@ def _comma_advice(delimiter: str) -> str:
 def raise_for_rows(
     path: Path, faults: Sequence[tuple[int, str]], doubts: Sequence[tuple[int, str]] = ()
 ) -> None:
-    """Raise an error if there are bad rows or rows that look wrong.
-
-    Raises
-    ------
-    IpsysError
-        There is at least one such row. The text names each row by its line.
-    """
+    """Raise an error if there are bad rows or rows that look wrong."""
     if faults or doubts:
         lines = "".join(f"\n  line {line}: {text}" for line, text in sorted([*faults, *doubts]))
         force_advice = "" if faults else ", or write it unchanged with --force"
@@ -151,12 +145,6 @@ def assign_intervals(
 
     The ``place`` of a row decides, else its ``time``. Without both, the number of such rows of a marker must
     equal the number of its stationary intervals. Then the rows are assigned in order.
-
-    Parameters
-    ----------
-    rows : rows of the sheet.
-    intervals : stationary intervals of the log.
-    markers : marker of each row; None if it is not known.
     """
     in_order: dict[int, list[int]] = {}
     for row, marker_id in zip(rows, markers, strict=True):
@@ -279,13 +267,7 @@ class _Row:
 
 
 def check_sheet(path: Path, log: Path, request: Request) -> None:
-    """Check that a sheet can be read, before the long processing of a log begins.
-
-    Raises
-    ------
-    IpsysError
-        See :func:`~ipsys_log.live_runs.survey.sheet.read_sheet`.
-    """
+    """Check that a sheet can be read, before the long processing of a log begins."""
     with Session([log]) as session:
         rigs = rigs_of(session, request)
         if rigs:
@@ -293,13 +275,7 @@ def check_sheet(path: Path, log: Path, request: Request) -> None:
 
 
 def add_sheet(scene: FinishedLog, path: Path, force: bool = False) -> list[str]:
-    """Append the measurements of a sheet: all of them, or none.
-
-    Parameters
-    ----------
-    scene : the log.
-    path : path of the sheet.
-    force : also write rows that look wrong but may be right.
+    """Append the measurements of a sheet: all of them, or none; with ``force``, also rows that look wrong.
 
     Returns
     -------

@@ -43,10 +43,6 @@ def write_recording(session: Session, runs: Sequence[str] = (), save: Path | Non
     runs : names of the runs to show; if empty, the newest complete runs.
     save : an ``.rrd`` file to write instead of opening a window; it has its name only when complete.
 
-    Returns
-    -------
-    The content that is shown.
-
     Raises
     ------
     IpsysError
@@ -147,13 +143,7 @@ class Series:
 
 
 def read_series(session: Session, runs: Sequence[str]) -> list[Series]:
-    """Return the latencies of a log, and the disagreement of cameras in some runs.
-
-    Raises
-    ------
-    LogError
-        A message cannot be read.
-    """
+    """Return the latencies of a log, and the disagreement of cameras in some runs."""
     disagreements = [_disagreements(session, run, several=len(runs) > 1) for run in runs]
     return [*_latencies(session), *(series for of_run in disagreements for series in of_run)]
 

@@ -39,13 +39,7 @@ def viewer_command(port: int | None = None) -> list[str]:
 
 
 def check_screen(environment: Mapping[str, str]) -> None:
-    """Check that a window can be opened.
-
-    Raises
-    ------
-    IpsysError
-        There is no display.
-    """
+    """Check that a window can be opened."""
     displays = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")
     if sys.platform.startswith("linux") and not any(environment.get(name) for name in displays):
         raise IpsysError(f"the viewer needs a screen, but this machine has none; {_INSTEAD}")
@@ -54,14 +48,7 @@ def check_screen(environment: Mapping[str, str]) -> None:
 def show_in_viewer(feed: Callable[[Callable[[bytes], object]], None]) -> None:
     """Open a viewer, feed it, and wait until its window is closed.
 
-    Parameters
-    ----------
-    feed : called with a function that takes the bytes of a recording, piece by piece.
-
-    Raises
-    ------
-    IpsysError
-        No window can be opened.
+    ``feed`` is called with a function that takes the bytes of a recording, piece by piece.
     """
     check_screen(os.environ)
     environment = {"RUST_LOG": "error", **os.environ}
@@ -153,13 +140,7 @@ class ViewerPage:
         return f"Rerun: only this machine; open http://{_LOOPBACK}:{self._page_port}/?url={source}"
 
     def show(self, feed: Callable[[Callable[[bytes], object]], object]) -> None:
-        """Feed the viewer; `feed` is called with a function that takes the bytes of a recording.
-
-        Raises
-        ------
-        IpsysError
-            The viewer has ended.
-        """
+        """Feed the viewer; `feed` is called with a function that takes the bytes of a recording."""
         assert self._process.stdin is not None
         try:
             feed(self._process.stdin.write)

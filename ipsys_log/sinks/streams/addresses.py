@@ -75,11 +75,6 @@ def find_destination(text: str, option: str) -> Destination:
     ----------
     option : the source of the text, for the message: ``--udp``.
 
-    Raises
-    ------
-    IpsysError
-        The text has another form, or the name of the host is not known.
-
     Examples
     --------
     >>> find_destination("9870", "--udp").address
@@ -99,14 +94,7 @@ def find_destination(text: str, option: str) -> Destination:
 def local_address(destination: Destination, host: str | None, option: str) -> str:
     """Return the address of this machine from which datagrams to a destination are sent.
 
-    Parameters
-    ----------
-    host : the address that the user named; None: datagrams stay on this machine.
-
-    Raises
-    ------
-    IpsysError
-        The destination is another machine, and the user named no host.
+    ``host`` is the address that the user named; None: datagrams stay on this machine.
     """
     if destination.is_loopback:
         return _LOOPBACK_6 if destination.family == socket.AF_INET6 else LOOPBACK
@@ -133,13 +121,7 @@ def refuse_bind(error: OSError, host: str, port: int, option: str) -> IpsysError
 
 
 def open_datagrams(destination: Destination, local: str, option: str) -> socket.socket:
-    """Return a socket that sends datagrams to a destination; those to a group pass no router (TTL 1).
-
-    Raises
-    ------
-    IpsysError
-        ``local`` is not an address of this machine, or no route leads to the destination.
-    """
+    """Return a socket that sends datagrams to a destination; those to a group pass no router (TTL 1)."""
     sending = socket.socket(destination.family, socket.SOCK_DGRAM)
     try:
         if destination.is_multicast:

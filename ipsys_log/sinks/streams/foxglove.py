@@ -268,9 +268,7 @@ class FoxgloveStream:
 class Client:
     """A client, used in the thread of the server only. A slow client loses messages, images first.
 
-    Parameters
-    ----------
-    drops : counts the messages that clients lose.
+    ``drops`` counts the messages that clients lose.
     """
 
     def __init__(self, connection: ServerConnection, drops: DropReport) -> None:

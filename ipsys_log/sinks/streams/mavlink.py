@@ -56,9 +56,7 @@ def encode_odometry(pose: StreamPose, north_rad: float) -> Any:
     The estimator is VISION: PX4 gives the poses of MOCAP to a topic that its filter does not read. An unknown
     velocity is NaN, and an unknown covariance begins with NaN.
 
-    Parameters
-    ----------
-    north_rad : the direction of north, from the x axis of the lab to its y axis.
+    ``north_rad`` is the direction of north, from the x axis of the lab to its y axis.
     """
     local = _localize(pose, north_rad)
     x, y, z, w = vector_quaternion(local.turn_rad)
@@ -182,13 +180,7 @@ class Endpoint(NamedTuple):
 
 
 def parse_endpoint(text: str) -> Endpoint:
-    """Return the endpoint ``ROBOT=HOST:PORT`` or ``ROBOT=HOST:PORT/vision``.
-
-    Raises
-    ------
-    IpsysError
-        The text has another form.
-    """
+    """Return the endpoint ``ROBOT=HOST:PORT`` or ``ROBOT=HOST:PORT/vision``."""
     robot, equals, rest = text.partition("=")
     target, _, message = rest.partition("/")
     if not (robot and equals and target):

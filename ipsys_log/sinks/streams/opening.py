@@ -42,13 +42,7 @@ def settings_of_rig(stream: RigStream | None, folder: Path) -> StreamSettings:
 
 @contextmanager
 def open_streams(context: StreamContext) -> Iterator[list[Stream]]:
-    """Open streams; their sockets are closed after the block.
-
-    Raises
-    ------
-    IpsysError
-        An address, a port or the key has a fault.
-    """
+    """Open streams; their sockets are closed after the block."""
     with ExitStack() as stack:
         streams: list[Stream] = []
         for name in context.settings.wanted:
@@ -71,12 +65,6 @@ def open_live_streams(
 
 
 def check_streams(settings: StreamSettings) -> list[str]:
-    """Open all sockets and close them again; return a line for each stream about its receivers.
-
-    Raises
-    ------
-    IpsysError
-        The errors of :func:`open_streams`.
-    """
+    """Open all sockets and close them again; return a line for each stream about its receivers."""
     with open_streams(StreamContext(settings, (), lambda: 0, lambda kind, text: None, 0)) as streams:
         return [stream.describe() for stream in streams]

@@ -107,9 +107,7 @@ def configure(domain: int, port: int, host: str | None = None, is_router: bool =
     As a router, it listens on the port. Else it is a client of the router there, and listens nowhere. No
     message comes in or passes through, whatever another session sends.
 
-    Parameters
-    ----------
-    host : the address to listen on; None: only this machine.
+    ``host`` is the address to listen on; None: only this machine.
     """
     endpoint = f"tcp/{_bracketed(host or LOOPBACK)}:{port}"
     settings: dict[str, Any] = {

@@ -222,9 +222,7 @@ def encode_diagnostics(
 
     The state of all positions of a live run has a status of its own.
 
-    Parameters
-    ----------
-    newest : the newest pose of each robot; None: no camera has seen it.
+    ``newest`` is the newest pose of each robot; None: no camera has seen it.
     """
     rows = [_status(robot, pose, session, now_ns, stale_s) for robot, pose in newest.items()]
     if state is not None:
@@ -237,13 +235,7 @@ def encode_diagnostics(
 
 
 def encode_image(camera: str, image: CompressedImage | RawImage | CompressedVideo) -> tuple[str, bytes]:
-    """Return the type and the bytes of the message of an image; its data stay as they are.
-
-    Raises
-    ------
-    IpsysError
-        The image is a frame of a video: ``sensor_msgs`` has no message for it.
-    """
+    """Return the type and the bytes of the message of an image; its data stay as they are."""
     if isinstance(image, CompressedVideo):
         raise IpsysError(
             f"camera {camera}: its images are {image.format} video, for which ROS 2 has no standard message; "

@@ -75,13 +75,7 @@ def _rounded_all(values: Iterable[float] | None) -> list[float] | None:
 
 
 def read_key(path: Path) -> bytes:
-    """Read the key of signatures from a file, without spaces and newlines at its ends.
-
-    Raises
-    ------
-    IpsysError
-        The file cannot be read, or the key is too short or too long.
-    """
+    """Read the key of signatures from a file, without spaces and newlines at its ends."""
     try:
         with path.open("rb") as file:
             key = file.read(_MOST_KEY_BYTES + 1).strip()

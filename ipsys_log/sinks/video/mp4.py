@@ -85,11 +85,6 @@ def write_video(
     run : the run of the tracks.
     robot : draw only this robot on the floor.
     rate_hz, size_px : frames per second; width and height, both even.
-
-    Raises
-    ------
-    IpsysError
-        The settings are not valid, the log has no images, or there is no such robot.
     """
     check_settings(rate_hz, size_px)
     if not session.images:
@@ -111,13 +106,7 @@ def _counted(messages: Iterable[Message], total: int, progress: Progress) -> Ite
 
 
 def read_scene(session: Session, run: str, robot: str | None = None) -> tuple[Scene, list[str]]:
-    """Return the constant part of the video of a run, and the topics that it shows.
-
-    Raises
-    ------
-    IpsysError
-        There is no such robot.
-    """
+    """Return the constant part of the video of a run, and the topics that it shows."""
     shown = choose_runs(session, [run])
     tracks = session.topics(TRACKS, run)
     low, high = np.full(2, np.inf), np.full(2, -np.inf)

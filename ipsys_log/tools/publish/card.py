@@ -72,13 +72,7 @@ _EMPTY = '""'
 
 
 def write_card_form(path: Path) -> None:
-    """Write the empty form of a dataset card.
-
-    Raises
-    ------
-    IpsysError
-        The file exists.
-    """
+    """Write the empty form of a dataset card."""
     if path.exists() or path.is_symlink():
         raise IpsysError(f"--card-form {path}: exists already; choose another name")
     with replacement_of(path) as file:

@@ -27,11 +27,6 @@ def kept_channels(session: Session, without_images: bool) -> set[str]:
     """Return the topics of derived channels that a pack keeps.
 
     Imported runs are kept, because no stage can compute them. Without images, the newest markers are kept.
-
-    Raises
-    ------
-    IpsysError
-        The images are left out, and no markers are detected yet.
     """
     imported = [run.run for run in session.runs() if stage_named(run.stage) is None]
     kept = {topic for run in imported for topic in _topics(session, run)}
@@ -53,13 +48,7 @@ def _topics(session: Session, run: str) -> set[str]:
 
 
 def cut_options(session: Session, kept: set[str], without_images: bool, every: int) -> CutOptions | None:
-    """Return the options of the cut of one log; None if nothing of it is kept but its settings.
-
-    Raises
-    ------
-    IpsysError
-        The log has measurements, but no frames or results that are kept.
-    """
+    """Return the options of the cut of one log; None if nothing of it is kept but its settings."""
     topics = {topic for reader in session.readers for topic in reader.channels if session.count(topic)}
     images = set(session.images.values()) if without_images else set()
     runs = {run for topic in topics if (run := run_of_topic(topic)) is not None}
@@ -100,13 +89,7 @@ _STEP = "blur"
 
 
 def marker_corners(session: Session) -> dict[tuple[str, int], list[NDArray[np.float64]]]:
-    """Return the corners of all markers in the newest detection, by camera and log time of the frame.
-
-    Raises
-    ------
-    IpsysError
-        No markers are detected yet.
-    """
+    """Return the corners of all markers in the newest detection, by camera and log time of the frame."""
     run = newest_run(session, MARKERS)
     if run is None:
         raise IpsysError(
@@ -126,9 +109,7 @@ def blur_image(grey: Grey, corners_px: Sequence[NDArray[np.float64]]) -> Grey:
 
     A filter that only smooths could be inverted; the mean of a block cannot.
 
-    Parameters
-    ----------
-    corners_px : of each marker, (4, 2).
+    ``corners_px`` has those of each marker, (4, 2).
     """
     import cv2
 
@@ -146,13 +127,7 @@ def blur_image(grey: Grey, corners_px: Sequence[NDArray[np.float64]]) -> Grey:
 
 
 def blur_log(path: Path, output: Path, corners: Corners, progress: Progress) -> None:
-    """Write a log with blurred grey images; all other known channels stay as they are.
-
-    Raises
-    ------
-    IpsysError
-        The log has video.
-    """
+    """Write a log with blurred grey images; all other known channels stay as they are."""
     with Session([path]) as session:
         runs = [None, *session.run_names()]
         topics = [

@@ -46,11 +46,6 @@ def check_member_name(name: str, where: str) -> str:
     Allowed are parts of letters, digits, ``_``, ``-`` and ``.``, separated by ``/``. No part begins with a
     dot. So a name is never absolute, and has no ``..``, backslash, drive or control character.
 
-    Raises
-    ------
-    IpsysError
-        The name has another form.
-
     Examples
     --------
     >>> check_member_name("logs/monday.mcap", "pack")
@@ -257,13 +252,7 @@ def json_text(value: Any) -> str:
 
 
 def parse_json(data: bytes, where: str) -> dict[str, Any]:
-    """Return the object of a JSON file.
-
-    Raises
-    ------
-    IpsysError
-        The file is not JSON, is nested too deep, has a number that is not finite, or is not an object.
-    """
+    """Return the object of a JSON file."""
     try:
         value = json.loads(data.decode(), parse_constant=_refuse_constant, parse_float=_finite)
     except RecursionError as error:

@@ -19,7 +19,7 @@ from typing import IO, BinaryIO, cast
 
 from ipsys_log.errors import IpsysError, is_full
 from ipsys_log.extras import check_installed
-from ipsys_log.plain_text import hide_password, plain_text
+from ipsys_log.plain_text import hide_password, join_names, plain_text
 from ipsys_log.tools.publish.manifest import (
     CHECKSUMS,
     LARGEST_TEXT,
@@ -113,8 +113,7 @@ def _check_list(files: "_PackFiles", manifest: Manifest) -> None:
 
 def _listed(names: Iterable[str]) -> str:
     listed = [*names]
-    more = f" and {len(listed) - _NAMED} more" if len(listed) > _NAMED else ""
-    return f"{', '.join(listed[:_NAMED])}{more} {'is' if len(listed) == 1 else 'are'}"
+    return f"{join_names(listed, _NAMED)} {'is' if len(listed) == 1 else 'are'}"
 
 
 def _check_space(size: int, folder: Path, where: str) -> None:
@@ -172,13 +171,7 @@ class _PackFiles:
 
 @contextmanager
 def _open_files(path: Path) -> Iterator[_PackFiles]:
-    """Yield the files of a pack: a folder or a zip archive. Nothing is extracted.
-
-    Raises
-    ------
-    IpsysError
-        The pack does not exist, is neither of both, or has a name or a size that is refused.
-    """
+    """Yield the files of a pack: a folder or a zip archive. Nothing is extracted."""
     if path.is_dir():
         yield _PackFiles(str(path), _list_folder(path), lambda name: _open_plain(path, name))
     elif not path.exists():
@@ -242,13 +235,7 @@ class _BoundedReads:
         self.seek, self.tell, self.seekable = file.seek, file.tell, file.seekable
 
     def read(self, size: int = -1) -> bytes:
-        """Return the next bytes.
-
-        Raises
-        ------
-        IpsysError
-            More bytes are requested than a table of members can have.
-        """
+        """Return the next bytes."""
         data = b"" if size > _LARGEST_READ else self._file.read(_LARGEST_READ + 1 if size < 0 else size)
         if max(size, len(data)) > _LARGEST_READ:
             raise IpsysError(f"{self._where}: its table of files is too large for a pack, so it is refused")

@@ -101,11 +101,6 @@ def compute_scores(
     logs : read as one session; they stay unchanged.
     results : a new log for the results.
     models : names of models; none: all that the logs allow.
-
-    Raises
-    ------
-    IpsysError
-        The pipeline refuses the logs.
     """
     from ipsys_log.live_runs.pipeline import replay
 
@@ -153,9 +148,7 @@ def _score(
 def scores_json(scores: Iterable[Score], width_px: int | None) -> dict[str, Any]:
     """Return expected scores with their tolerances, and the environment in which they were computed.
 
-    Parameters
-    ----------
-    width_px : width of the narrowest images; None if the pack has none.
+    ``width_px`` is the width of the narrowest images; None if the pack has none.
     """
     tolerance_mm = _TOLERANCE_MM
     if width_px is not None:
@@ -172,13 +165,7 @@ def scores_json(scores: Iterable[Score], width_px: int | None) -> dict[str, Any]
 
 
 def parse_scores(data: bytes, where: str) -> StatedScores:
-    """Return the expected scores of a pack.
-
-    Raises
-    ------
-    IpsysError
-        The file has another form, belongs to a newer version, or names a model that is not known here.
-    """
+    """Return the expected scores of a pack."""
     where = f"{where}: {SCORES}"
     table = parse_json(data, where)
     version, rows, versions = (table.get(key) for key in ("version", "scores", "models"))

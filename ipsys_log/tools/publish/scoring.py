@@ -47,13 +47,7 @@ class OwnModel:
 
 
 def load_own_model(text: str) -> OwnModel:
-    """Load a class or a function from ``FILE.py:NAME``. The file is executed.
-
-    Raises
-    ------
-    IpsysError
-        There is no such file, or it has no such class.
-    """
+    """Load a class or a function from ``FILE.py:NAME``. The file is executed."""
     file, _, name = text.rpartition(":")
     path = Path(file)
     if not file or not name.isidentifier():

@@ -96,13 +96,7 @@ def _is_reserved(topic: str) -> bool:
 
 
 def check_messages(session: Session, progress: Callable[[int], None]) -> Iterator[LogFinding]:
-    """Decode each message of the known channels without images.
-
-    Raises
-    ------
-    BoundError
-        The messages exceed the limits of the file size.
-    """
+    """Decode each message of the known channels without images."""
     faults: dict[str, tuple[int, int, str]] = {}
     for number, (raw, message) in enumerate(session.attempts(decoded_topics(session)), 1):
         if isinstance(message, BoundError):

@@ -173,9 +173,7 @@ class _Occurrences:
 class MessageTimes:
     """The times of messages in the order of the file; the memory does not grow with their number.
 
-    Parameters
-    ----------
-    stamped : the topics of images whose publish times are the stamps of a camera.
+    ``stamped`` are the topics of images whose publish times are the stamps of a camera.
     """
 
     stamped: Collection[str]

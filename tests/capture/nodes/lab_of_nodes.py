@@ -85,10 +85,7 @@ def sending(
     """Open a node whose frames the test makes."""
     clock = clock or Clock()
     path = folder / f"{camera}_{free_port()}.mcap"
-    with (
-        LogWriter.create(path) as log,
-        Node(camera, network, version, path, clock, say) as node,
-    ):
+    with LogWriter.create(path) as log, Node(camera, network, version, path, clock, say) as node:
         yield Feed(node, log, camera, clock)
 
 

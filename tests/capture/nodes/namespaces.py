@@ -1,7 +1,5 @@
 """Hosts as network namespaces of Linux: a node and a centre that reach each other only through a relay."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -5,8 +5,6 @@ Its cameras on USB are replaced: each frame is different, so tests can tell them
     python -m tests.capture.nodes.patient_host UTC_MINUS_MONOTONIC_NS COMMAND [OPTIONS]
 """
 
-from __future__ import annotations
-
 import sys
 import time
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Frames of nodes over a session of Zenoh: bytes, times, gaps, certificates and refusals."""
 
-from __future__ import annotations
-
 import json
 import socket
 import threading

@@ -1,7 +1,5 @@
 """The centre of a hall: the markers of 24 nodes, its log, and the repetition of its results."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Generator
 from contextlib import ExitStack

@@ -1,7 +1,5 @@
 """The stream of a node at the centre: every frame once, gaps, sessions, versions and jumps of the clock."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The process that receives the frames of nodes: its frames, its end, and its faults."""
 
-from __future__ import annotations
-
 import os
 import signal
 import socket

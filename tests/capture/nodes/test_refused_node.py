@@ -1,7 +1,5 @@
 """A node that its centre refuses: its end, and what it tells the user."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from itertools import count
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A node and a centre on separate hosts, with certificates, behind a network with delays and faults."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import time

@@ -58,12 +58,7 @@ class _Part:
 
 
 class Feed:
-    """The server-sent events of a dashboard. For one thread.
-
-    Parameters
-    ----------
-    dashboard : gives the data.
-    """
+    """The server-sent events of a dashboard. For one thread."""
 
     def __init__(self, dashboard: Dashboard) -> None:
         self._dashboard = dashboard
@@ -121,9 +116,7 @@ def build_dashboard(dashboard: Dashboard, setup: str | None = None) -> Starlette
 
     The guard marks the requests of devices that may write. Without a guard, all requests may write.
 
-    Parameters
-    ----------
-    setup : the address of the setup page that shows this page; None: there is none.
+    ``setup`` is the address of the setup page that shows this page; None: there is none.
     """
     answers = _Answers(dashboard, setup)
     return Starlette(

@@ -39,11 +39,6 @@ def describe_floor(rig: Rig | None, model: Model | None, lenses: Mapping[str, Ca
     rig : None if the log has none.
     model : the fitted model; None without one. Its calibration points give the poses of the cameras.
     lenses : intrinsics by camera.
-
-    Raises
-    ------
-    IpsysError
-        The model or the intrinsics of a camera are not valid.
     """
     cameras = {} if model is None else read_floor_cameras(model, lenses)
     colours = camera_styles(lenses)

@@ -251,14 +251,7 @@ class Dashboard:
 class PlayedLog:
     """The playback of a log.
 
-    Parameters
-    ----------
-    player : plays the log.
-    scene : the constant parts of the log.
-
-    Attributes
-    ----------
-    states : states of the cameras, by name. A log does not tell the number of dropped frames.
+    ``states`` are those of the cameras, by name. A log does not tell the number of dropped frames.
     """
 
     def __init__(self, player: Player, scene: PlayedScene) -> None:
@@ -295,13 +288,7 @@ class PlayedLog:
         }
 
     def control(self, body: Mapping[str, Any]) -> dict[str, Any]:
-        """Pause or continue, move to a time, or change the rate; return the new state of the playback.
-
-        Raises
-        ------
-        IpsysError
-            A value is not a number, or the rate is outside its range.
-        """
+        """Pause or continue, move to a time, or change the rate; return the new state of the playback."""
         player, numbers = self._player, {}
         for name in body.keys() & {"seconds", "rate"}:
             if type(body[name]) not in (int, float) or not isfinite(body[name]):

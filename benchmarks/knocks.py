@@ -34,7 +34,7 @@ from ipsys_log.capture.simulation.lab import EPOCH_NS
 from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.messages import CameraPoses, Event, Markers, Message, Model
 from ipsys_log.messages.models import MOVED, PARTLY, REPAIRED
-from ipsys_log.stages.watch import WatchCameras
+from ipsys_log.statistics.camera_watch import WatchCameras
 from ipsys_log.units import MM_PER_M, NS_PER_S
 from ipsys_log.vision.poses import rotation
 from tests.geometric.knocks import Disturbance, Place, disturb, drive_messages

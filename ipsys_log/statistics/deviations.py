@@ -1,10 +1,9 @@
 """Deviations between the cameras of a joint model, and their stream from the markers in images.
 
-Where a camera alone sees a robot, the size of the marker gives its height, which deviates from that of the
-rig. Where two cameras see a robot, their positions and headings deviate from each other. The corners of a
-reference marker deviate from where they were. These values repeat with the place: they come from the errors
-of the calibration, of the lenses and of the floor. The height and the print of each robot's marker add a
-constant.
+The size of a marker in one image gives its height, which deviates from that of the rig. The positions and
+headings of a robot by two cameras deviate from each other. The corners of a reference marker deviate from
+where they were. These values repeat with the place: they come from the errors of the calibration, of the
+lenses and of the floor. The height and the print of each robot's marker add a constant.
 """
 
 from __future__ import annotations

@@ -166,7 +166,8 @@ def drift(
     """Show which camera moved, when, and by how much its positions are wrong since then.
 
     The command compares reference markers, which are fixed to the floor or to a wall, in logs of weeks. The
-    rig lists them under reference_markers. It finds a mean shift of the floor map from 2 mm on.
+    rig lists them under reference_markers. Without them, it uses robots that drive, with the model joint. It
+    finds a mean shift of the floor map from 2 mm on.
 
     Examples
 

@@ -18,7 +18,6 @@ from ipsys_log.messages.events import MARKER_MOVED
 from ipsys_log.messages.models import MOVED
 from ipsys_log.models.table import reads_corners
 from ipsys_log.plain_text import shell_words
-from ipsys_log.stages.watch import WatchCameras
 from ipsys_log.statistics.camera_moves import (
     CameraState,
     DriftLog,
@@ -29,6 +28,7 @@ from ipsys_log.statistics.camera_moves import (
     image_sizes,
     read_windows,
 )
+from ipsys_log.statistics.camera_watch import WatchCameras
 from ipsys_log.statistics.deviations import STEP_NS
 from ipsys_log.statistics.drift import DriftBaseline, Motion
 from ipsys_log.statistics.floor_cameras import read_floor_cameras

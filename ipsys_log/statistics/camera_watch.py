@@ -1,0 +1,354 @@
+"""The watch over the cameras: it names what has changed, and repairs the poses of moved cameras."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ipsys_log.calibration.joint.model import JointModel
+from ipsys_log.calibration.joint.payload import move_camera, restore_joint
+from ipsys_log.messages import Array, CameraPose, CameraPoses, Event, Markers, Message, Model, Rig
+from ipsys_log.messages.events import (
+    CAMERA_DRIFTED,
+    CAMERA_MOVED,
+    CAMERA_REPAIRED,
+    CLOCK_JUMPED,
+    MARKER_MOVED,
+)
+from ipsys_log.messages.models import CLEARED, MOVED, PARTLY, REPAIRED, SUSPECTED
+from ipsys_log.statistics.camera_changes import (
+    TESTED_STEPS,
+    Cause,
+    Evidence,
+    Finding,
+    Repair,
+    ViewedFloor,
+    find_causes,
+    gather_evidence,
+    is_change,
+    likely_causes,
+)
+from ipsys_log.statistics.deviations import STEP_NS, DeviationStream, Step
+from ipsys_log.statistics.usual_deviations import UsualDeviations
+from ipsys_log.units import MM_PER_M, NS_PER_S
+
+# A change whose cause stays unclear is examined for so long.
+_LONGEST_UNCLEAR_NS = 60 * NS_PER_S
+# Ages of a repair at which its estimate comes into use, and the largest standard deviation for that, as the
+# mean over the floor. A less certain estimate is used in part if its standard deviation is below this share
+# of the error of the old positions; from the last age on, any.
+_ADOPTIONS_NS = tuple(age_s * NS_PER_S for age_s in (3, 6, 10, 20, 60))
+_CERTAIN_M, _BETTER = 4e-4, 0.2
+# A repair with a larger mean square of its residuals is refused: no motion of the camera explains them.
+_MOST_MISFIT = 4.0
+_FEWEST_DEVIATIONS = 20
+# With a larger error of the first estimate, the slopes are wrong: the repair begins again.
+_LINEAR_M = 5e-4
+_NEVER_NS = 2**62
+# Share of level markers in a camera whose pose is right; the pose of another one is unknown to this extent.
+_MANY_LEVEL, _FAR_RAD, _FAR_M = 0.7, 0.2, 0.2
+# A carried marker is left out for so long; the same finding within the second time is no new event.
+_IGNORED_NS, _REPEATED_NS = 10 * NS_PER_S, 60 * NS_PER_S
+# Slow motions are examined at multiples of this log time. They are reported from this mean error on, with so
+# many standard deviations: an image that moves by 0.2 px in a warm camera shifts positions by 0.9 mm.
+_DRIFT_CHECK_NS, _LEAST_DRIFT_M, _SURE_SIGMAS = 60 * NS_PER_S, 0.0015, 5.0
+# Smaller jumps of a clock are corrected within this stage only. A larger one displaces robots of this speed.
+_LEAST_JUMP_MS, _SPEED_M_S = 3.0, 0.5
+
+
+@dataclass(slots=True, eq=False)
+class _Examined:
+    """A step with the evidence in its deviations."""
+
+    step: Step
+    evidence: Mapping[Cause, Evidence]
+
+
+@dataclass(slots=True, eq=False)
+class _Moved:
+    """A camera that has moved: since when, when it was named, and its repair.
+
+    ``shift_m`` is the mean error of its old positions, ``next_ns`` the age at which the estimate is used
+    next, and ``state`` that of its pose in use.
+    """
+
+    since_ns: int
+    named_ns: int
+    shift_m: float
+    repair: Repair = field(default_factory=Repair)
+    next_ns: int = _ADOPTIONS_NS[0]
+    state: str = MOVED
+
+
+@dataclass(slots=True, eq=False)
+class _Unclear:
+    """A change whose cause is not clear: since when, when it was noticed, and the likely causes so far."""
+
+    since_ns: int
+    noticed_ns: int
+    likely: list[Cause] = field(default_factory=list)
+
+
+class WatchCameras:
+    """The step from markers to the poses of moved cameras, and events that name what has changed.
+
+    All times are log times, so that a replay gives the same results.
+
+    Parameters
+    ----------
+    model : a joint model.
+    self_calibrate : whether new poses are estimated and used.
+    """
+
+    def __init__(self, model: Model, self_calibrate: bool) -> None:
+        self._stream, self._usual = DeviationStream(restore_joint(model)), UsualDeviations()
+        self._self_calibrate = self_calibrate
+        self._floors: dict[str, ViewedFloor] = {}
+        self._steps: deque[_Examined] = deque()
+        self._done_ns = 0
+        self._unclear: _Unclear | None = None
+        self._suspected: list[str] = []
+        self._moved: dict[str, _Moved] = {}
+        self._adopted: dict[str, Array] = {}
+        self._named_ns: dict[str, int] = {}
+        self._level: set[str] = set()
+
+    def __call__(self, message: Message) -> Iterator[Any]:
+        if isinstance(message.payload, Rig):
+            for marker_id in self._stream.use_rig(message.payload):
+                self._usual.forget(marker_id)
+        elif isinstance(message.payload, Markers):
+            self._see_floor(str(message.camera), message.payload)
+            for step in self._stream(message):
+                yield from self._take(step)
+
+    def _see_floor(self, camera: str, frame: Markers) -> None:
+        model, rig = self._stream.cameras.get(camera), self._stream.rig
+        if model is not None and rig is not None and camera not in self._floors:
+            self._floors[camera] = ViewedFloor.of_camera(
+                model, frame.width, frame.height, rig.marker_length_m
+            )
+
+    def _take(self, step: Step) -> Iterator[Any]:
+        """Test the deviations of half a second, and improve the repairs."""
+        time_ns, self._done_ns = step.time_ns, step.last_ns
+        for camera in sorted(self._stream.fits):
+            yield from self._check_level(camera, time_ns)
+        for camera, moved in self._moved.items():
+            moved.repair.add(self._usual, step.deviations, camera, time_ns)
+        unused = [camera for camera, moved in self._moved.items() if moved.state != REPAIRED]
+        self._steps.append(_Examined(step, gather_evidence(self._usual, step.deviations, time_ns, unused)))
+        yield from self._examine(time_ns)
+        for camera in list(self._moved):
+            yield from self._adopt(camera, time_ns)
+        if time_ns % _DRIFT_CHECK_NS == 0:
+            yield from self._check_drift()
+
+    def poses(self) -> dict[str, tuple[JointModel, Array]]:
+        """Return the pose of each camera by the last sightings, and the covariance (6, 6) of its motion."""
+        motions = self._usual.slow_motions(sorted(self._stream.cameras))
+        found = {}
+        for camera, model in self._stream.cameras.items():
+            moved = self._moved.get(camera)
+            slow = motions[camera] if moved is None else (moved.repair.motion, moved.repair.covariance)
+            found[camera] = move_camera(model, slow[0]), slow[1] + self._adopted.get(camera, 0.0)
+        return found
+
+    def floor_of(self, camera: str) -> ViewedFloor | None:
+        """Return the floor that a camera sees; None before its first frame."""
+        return self._floors.get(camera)
+
+    def _check_drift(self) -> Iterator[Any]:
+        """Report cameras that have moved slowly since the start, or since their last repair."""
+        motions = self._usual.slow_motions(sorted(self._stream.cameras))
+        for camera, (motion, covariance) in motions.items():
+            floor = self._floors.get(camera)
+            if floor is None or camera in self._moved:
+                continue
+            shift_m, sigma_m = floor.mean_shift(motion), floor.mean_sigma(covariance)
+            if shift_m > max(_LEAST_DRIFT_M, _SURE_SIGMAS * sigma_m):
+                text = f"camera {camera} has drifted: its mean error grew by {shift_m * MM_PER_M:.1f} mm"
+                yield Event(self._done_ns, CAMERA_DRIFTED, text, camera)
+                self._usual.forget_camera(camera)
+                if self._self_calibrate:
+                    self._stream.move(camera, motion)
+                    self._adopted[camera] = covariance + self._adopted.get(camera, 0.0)
+                    pose = self._pose(camera, REPAIRED, self._done_ns, self._adopted[camera])
+                    yield CameraPoses(self._done_ns, (pose,))
+
+    def _check_level(self, camera: str, time_ns: int) -> Iterator[Any]:
+        """Report a camera in which no marker is level any more: it was turned far, or exchanged."""
+        level, markers = np.sum([(0, 0), *self._stream.fits[camera]], axis=0).tolist()
+        if markers < _FEWEST_DEVIATIONS or camera in self._moved:
+            return
+        if level > _MANY_LEVEL * markers:
+            self._level.add(camera)
+        elif level < (1 - _MANY_LEVEL) * markers and camera in self._level:
+            covariance = np.diag(np.repeat([_FAR_RAD, _FAR_M], 3) ** 2)
+            pose = self._pose(camera, MOVED, self._done_ns, covariance)
+            yield CameraPoses(self._done_ns, (pose,))
+            text = (
+                f"camera {camera} was turned far, or exchanged: no marker is level; calibrate the lab again"
+            )
+            yield Event(self._done_ns, CAMERA_MOVED, text, camera, start=self._done_ns)
+            self._moved[camera] = _Moved(self._done_ns, time_ns, _FAR_M, next_ns=_NEVER_NS)
+
+    def _examine(self, time_ns: int) -> Iterator[Any]:
+        """Test the last steps for a change; report it, and its cause when that is clear."""
+        while self._unclear is None and len(self._steps) > TESTED_STEPS:
+            self._learn(self._steps.popleft().step)
+        findings = find_causes([one.evidence for one in self._steps])
+        if not findings or (self._unclear is None and not is_change(findings[0], self._floors)):
+            return
+        likely = likely_causes(findings)
+        if self._unclear is None:
+            for _ in range(findings[0].first):
+                self._learn(self._steps.popleft().step)
+            self._unclear = _Unclear(self._steps[0].step.last_ns - STEP_NS, time_ns)
+            yield from self._suspect(likely)
+            # This step is partly from before the change.
+            self._steps[0].evidence = {}
+            return
+        # Two successive steps must agree.
+        before, self._unclear.likely = self._unclear.likely, [one.cause for one in likely]
+        is_clear = len(likely) == 1 and before == self._unclear.likely and is_change(likely[0], self._floors)
+        if is_clear or time_ns - self._unclear.noticed_ns > _LONGEST_UNCLEAR_NS:
+            since_ns, self._unclear = self._unclear.since_ns, None
+            steps, self._steps = [one.step for one in self._steps], deque()
+            if is_clear:
+                yield from self._name(likely[0], since_ns, time_ns)
+                name = likely[0].cause.name
+                for step in steps:
+                    kept = [one for one in step.deviations if name not in (str(one.marker_id), *one.cameras)]
+                    self._learn(Step(step.time_ns, step.last_ns, kept))
+
+    def _learn(self, step: Step) -> None:
+        known = [one for one in step.deviations if not set(one.cameras) & set(self._moved)]
+        self._usual.learn(known, step.time_ns)
+
+    def _suspect(self, likely: Sequence[Finding]) -> Iterator[Any]:
+        """Report that a camera may have moved; positions of all possible ones become uncertain."""
+        assert self._unclear is not None
+        since_ns = self._unclear.since_ns
+        poses = [self._old_pose(one, SUSPECTED, since_ns) for one in likely if one.cause.kind == "camera"]
+        if poses:
+            self._suspected = [pose.camera for pose in poses]
+            yield CameraPoses(self._done_ns, tuple(poses))
+            names = " or ".join(dict.fromkeys(_describe(one.cause) for one in likely))
+            text = f"a change of {names}; the next seconds show which"
+            camera = poses[0].camera if len(likely) == 1 else None
+            yield Event(self._done_ns, CAMERA_MOVED, text, camera, start=since_ns)
+
+    def _old_pose(self, finding: Finding, state: str, since_ns: int) -> CameraPose:
+        """Return the present pose of a camera, whose covariance contains the motion that was found."""
+        covariance = finding.covariance + np.outer(finding.estimate, finding.estimate)
+        return self._pose(finding.cause.name, state, since_ns, covariance)
+
+    def _pose(
+        self, camera: str, state: str, since_ns: int, covariance: Array, deviations: int = 0
+    ) -> CameraPose:
+        """Return the present pose of a camera as a payload."""
+        model = self._stream.cameras[camera]
+        turn, origin_m = model.camera_from_world, model.origin_m
+        return CameraPose(camera, state, since_ns, origin_m, turn, covariance, deviations)
+
+    def _name(self, finding: Finding, since_ns: int, time_ns: int) -> Iterator[Any]:
+        """Report the cause of a change."""
+        kind, name = finding.cause
+        poses = [
+            self._pose(camera, CLEARED, since_ns, self._adopted.get(camera, np.zeros((6, 6))))
+            for camera in self._suspected
+            if kind != "camera" or camera != name
+        ]
+        self._suspected = []
+        if kind == "camera":
+            poses.append(self._old_pose(finding, MOVED, since_ns))
+            shift_m = self._floors[name].mean_shift(finding.estimate)
+            advice = "its new pose is being estimated" if self._self_calibrate else "use --self-calibrate"
+            text = f"camera {name} has moved: its mean error is {shift_m * MM_PER_M:.1f} mm; {advice}"
+            yield Event(self._done_ns, CAMERA_MOVED, text, name, start=since_ns)
+            self._stream.move(name, finding.estimate)
+            self._moved[name] = _Moved(since_ns, time_ns, shift_m)
+        elif kind == "clock":
+            jump_ms = float(finding.estimate[0]) * 1e3
+            text = f"the clock of camera {name} jumped by {jump_ms:.0f} ms; start this camera again"
+            if abs(jump_ms) > _LEAST_JUMP_MS and time_ns - self._named_ns.get(name, 0) > _REPEATED_NS:
+                covariance = np.diag(np.repeat([0.001, _SPEED_M_S * jump_ms * 1e-3], 3) ** 2)
+                poses.append(self._pose(name, MOVED, since_ns, covariance))
+                yield Event(self._done_ns, CLOCK_JUMPED, text, name, start=since_ns)
+            self._named_ns[name] = time_ns
+            self._stream.delay(name, -round(float(finding.estimate[0]) * NS_PER_S))
+        elif kind == "carried":
+            if time_ns - self._named_ns.get(name, 0) > _REPEATED_NS:
+                text = f"marker {name} is not level at its height: it is carried, loose, or of another height"
+                yield Event(self._done_ns, MARKER_MOVED, text, marker_id=int(name), start=since_ns)
+            self._named_ns[name] = time_ns
+            self._stream.ignore(int(name), time_ns + _IGNORED_NS)
+            self._usual.forget(int(name))
+        else:
+            size_mm = float(np.linalg.norm(finding.estimate[:3])) * MM_PER_M
+            what = "has another height on its robot" if kind == "robot" else "has moved"
+            advice = "measure it again, and correct lab.toml"
+            text = f"{_describe(finding.cause)} {what}, by {size_mm:.1f} mm; {advice}"
+            yield Event(self._done_ns, MARKER_MOVED, text, marker_id=int(name), start=since_ns)
+            self._stream.ignore(int(name), time_ns)
+            self._usual.forget(int(name))
+        if poses:
+            yield CameraPoses(self._done_ns, tuple(poses))
+
+    def _adopt(self, camera: str, time_ns: int) -> Iterator[Any]:
+        """Use the estimate of a repair once it is certain; end the repair with the last estimate."""
+        moved, age_ns = self._moved[camera], time_ns - self._moved[camera].named_ns
+        repair = moved.repair
+        if not self._self_calibrate or age_ns < moved.next_ns or repair.count < _FEWEST_DEVIATIONS:
+            return
+        moved.next_ns = next((one for one in _ADOPTIONS_NS if one > age_ns), age_ns + _ADOPTIONS_NS[-1])
+        is_last = age_ns >= _ADOPTIONS_NS[-1]
+        if repair.misfit > _MOST_MISFIT:
+            if not is_last and self._floors[camera].mean_shift(repair.motion) > _LINEAR_M:
+                self._stream.move(camera, repair.motion)
+                moved.repair = Repair()
+            elif is_last or moved.state != MOVED:
+                yield from self._refuse(camera, moved)
+            return
+        covariance = repair.covariance * max(repair.misfit, 1.0)
+        sigma_m = self._floors[camera].mean_sigma(covariance)
+        is_certain = sigma_m < _CERTAIN_M
+        if not (is_certain or is_last or sigma_m < _BETTER * moved.shift_m):
+            return
+        self._stream.move(camera, repair.motion)
+        repair.rebase()
+        self._adopted[camera] = covariance
+        state = REPAIRED if is_certain else PARTLY
+        pose = self._pose(camera, state, moved.since_ns, covariance, repair.count)
+        yield CameraPoses(self._done_ns, (pose,))
+        if is_last or state != moved.state:
+            known = f"known to {max(sigma_m * MM_PER_M, 0.1):.1f} mm"
+            if not is_certain:
+                known += " in part; drive through the overlap, or add a reference marker"
+            text = f"camera {camera}: positions use its new pose, {known}"
+            yield Event(self._done_ns, CAMERA_REPAIRED, text, camera, start=moved.since_ns)
+        moved.state = state
+        if is_last and is_certain:
+            del self._moved[camera]
+
+    def _refuse(self, camera: str, moved: _Moved) -> Iterator[Any]:
+        """End a repair without a new pose."""
+        if moved.state != MOVED:
+            covariance = np.diag(np.repeat([moved.shift_m / 2, moved.shift_m], 3) ** 2)
+            yield CameraPoses(self._done_ns, (self._pose(camera, MOVED, moved.since_ns, covariance),))
+        moved.state, moved.next_ns = MOVED, _NEVER_NS
+        text = (
+            f"camera {camera}: no motion explains its deviations: its lens was changed, or it is another "
+            "camera; calibrate the lab again"
+        )
+        yield Event(self._done_ns, CAMERA_MOVED, text, camera, start=moved.since_ns)
+
+
+def _describe(cause: Cause) -> str:
+    others = {"robot": "marker", "carried": "marker", "reference": "reference marker"}
+    return f"{others.get(cause.kind, cause.kind)} {cause.name}".replace("clock", "the clock of camera")

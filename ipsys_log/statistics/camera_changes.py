@@ -143,14 +143,13 @@ def _sum_evidence(rows: Sequence[tuple[Array, Array, Array]]) -> Evidence:
     return Evidence(slopes.T @ weighted, weighted.T @ differences)
 
 
-def find_causes(steps: Sequence[Mapping[Cause, Evidence]]) -> list[Finding]:
-    """Return a finding for each cause, the most likely one first.
+def find_causes(steps: Sequence[Mapping[Cause, Evidence]]) -> Iterator[Finding]:
+    """Yield a finding for each cause.
 
     Parameters
     ----------
     steps : the evidence of successive steps; a change lasts from one of them to the last.
     """
-    findings = []
     for cause in sorted({cause for step in steps for cause in step}):
         own = [(number, step[cause]) for number, step in enumerate(steps) if cause in step]
         information = np.cumsum([one.information for _, one in reversed(own)], axis=0)
@@ -160,10 +159,9 @@ def find_causes(steps: Sequence[Mapping[Cause, Evidence]]) -> list[Finding]:
         if cause.kind == "carried":
             best = int(constant.argmax())
             zero = float(constant[best])
-            findings.append(Finding(cause, starts[best], zero, zero, np.zeros(0), np.zeros((0, 0))))
+            yield Finding(cause, starts[best], zero, zero, np.zeros(0), np.zeros((0, 0)))
         else:
-            findings.append(_best_start(cause, information, gradient, starts))
-    return sorted(findings, key=lambda one: -one.evidence)
+            yield _best_start(cause, information, gradient, starts)
 
 
 def _sizes(cause: Cause) -> list[Array]:
@@ -301,5 +299,6 @@ def is_change(finding: Finding, floors: Mapping[str, ViewedFloor]) -> bool:
 
 
 def likely_causes(findings: Sequence[Finding]) -> list[Finding]:
-    """Return the findings that are nearly as likely as the best one."""
-    return [one for one in findings if one.evidence > findings[0].evidence - _LEAD]
+    """Return the findings that are nearly as likely as the best one, the best first."""
+    ordered = sorted(findings, key=lambda one: -one.evidence)
+    return [one for one in ordered if one.evidence > ordered[0].evidence - _LEAD]

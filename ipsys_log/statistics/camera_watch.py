@@ -56,6 +56,8 @@ _IGNORED_NS, _REPEATED_NS = 10 * NS_PER_S, 60 * NS_PER_S
 # Slow motions are examined at multiples of this log time. They are reported from this mean error on, with so
 # many standard deviations: an image that moves by 0.2 px in a warm camera shifts positions by 0.9 mm.
 _DRIFT_CHECK_NS, _LEAST_DRIFT_M, _SURE_SIGMAS = 60 * NS_PER_S, 0.0015, 5.0
+# Causes that are tested without a pause.
+_AT_ONCE = 4
 # Smaller jumps of a clock are corrected within this stage only. A larger one displaces robots of this speed.
 _LEAST_JUMP_MS, _SPEED_M_S = 3.0, 0.5
 
@@ -116,6 +118,8 @@ class WatchCameras:
         self._adopted: dict[str, Array] = {}
         self._named_ns: dict[str, int] = {}
         self._level: set[str] = set()
+        # The rest of the work on the last step.
+        self._work: Iterator[Any] = iter(())
 
     def __call__(self, message: Message) -> Iterator[Any]:
         if isinstance(message.payload, Rig):
@@ -123,8 +127,13 @@ class WatchCameras:
                 self._usual.forget(marker_id)
         elif isinstance(message.payload, Markers):
             self._see_floor(str(message.camera), message.payload)
-            for step in self._stream(message):
-                yield from self._take(step)
+            if self._stream.collect(message):
+                yield from (payload for payload in self._work if payload is not None)
+                self._work = self._take_step()
+            for payload in self._work:
+                if payload is None:
+                    break
+                yield payload
 
     def _see_floor(self, camera: str, frame: Markers) -> None:
         model, rig = self._stream.cameras.get(camera), self._stream.rig
@@ -133,15 +142,24 @@ class WatchCameras:
                 model, frame.width, frame.height, rig.marker_length_m
             )
 
-    def _take(self, step: Step) -> Iterator[Any]:
-        """Test the deviations of half a second, and improve the repairs."""
+    def _take_step(self) -> Iterator[Any]:
+        """Test the deviations of half a second, and improve the repairs.
+
+        None in the result are pauses: the next frame goes on from there, so that no frame waits for all.
+        """
+        parts = self._stream.finish_step()
+        while (step := next(parts)) is None:
+            yield None
+        yield None
         time_ns, self._done_ns = step.time_ns, step.last_ns
         for camera in sorted(self._stream.fits):
             yield from self._check_level(camera, time_ns)
         for camera, moved in self._moved.items():
             moved.repair.add(self._usual, step.deviations, camera, time_ns)
         unused = [camera for camera, moved in self._moved.items() if moved.state != REPAIRED]
+        yield None
         self._steps.append(_Examined(step, gather_evidence(self._usual, step.deviations, time_ns, unused)))
+        yield None
         yield from self._examine(time_ns)
         for camera in list(self._moved):
             yield from self._adopt(camera, time_ns)
@@ -201,12 +219,17 @@ class WatchCameras:
         """Test the last steps for a change; report it, and its cause when that is clear."""
         while self._unclear is None and len(self._steps) > TESTED_STEPS:
             self._learn(self._steps.popleft().step)
-        findings = find_causes([one.evidence for one in self._steps])
-        if not findings or (self._unclear is None and not is_change(findings[0], self._floors)):
+            yield None
+        findings = []
+        for finding in find_causes([one.evidence for one in self._steps]):
+            findings.append(finding)
+            if len(findings) % _AT_ONCE == 0:
+                yield None
+        likely = likely_causes(findings) if findings else []
+        if not likely or (self._unclear is None and not is_change(likely[0], self._floors)):
             return
-        likely = likely_causes(findings)
         if self._unclear is None:
-            for _ in range(findings[0].first):
+            for _ in range(likely[0].first):
                 self._learn(self._steps.popleft().step)
             self._unclear = _Unclear(self._steps[0].step.last_ns - STEP_NS, time_ns)
             yield from self._suspect(likely)

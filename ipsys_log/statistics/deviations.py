@@ -103,20 +103,13 @@ class Deviation:
         return {camera: sign * by_motion for camera, sign, by_motion in rows}
 
 
-def find_deviations(
-    sightings: Mapping[str, LevelSightings], first_ns: int, last_ns: int
+def _find_deviations(
+    sightings: Mapping[str, LevelSightings], camera: str, others: Sequence[str], first_ns: int, last_ns: int
 ) -> Iterator[Deviation]:
-    """Yield the deviations in the sightings after a time and until another one.
-
-    Parameters
-    ----------
-    sightings : by camera; those around this time serve to interpolate.
-    """
-    names = sorted(sightings)
-    for number, name in enumerate(names):
-        yield from _rises(name, sightings[name], first_ns, last_ns)
-        for other in names[:number]:
-            yield from _pairs((other, name), sightings[other], sightings[name], first_ns, last_ns)
+    """Yield the deviations of a camera, by itself and from others, after a time and until another one."""
+    yield from _rises(camera, sightings[camera], first_ns, last_ns)
+    for other in others:
+        yield from _pairs((other, camera), sightings[other], sightings[camera], first_ns, last_ns)
 
 
 def _rises(camera: str, seen: LevelSightings, first_ns: int, last_ns: int) -> Iterator[Deviation]:
@@ -270,11 +263,11 @@ class DeviationStream:
         self._ignored_ns[marker_id] = until_ns
         self._fixed = {key: fixed for key, fixed in self._fixed.items() if key[1] != marker_id}
 
-    def __call__(self, message: Message) -> Iterator[Step]:
-        """Yield the step that a message of markers completes."""
+    def collect(self, message: Message) -> bool:
+        """Collect the markers of a frame; return whether they complete a step."""
         camera, rig = str(message.camera), self.rig
         if camera not in self.cameras or rig is None:
-            return
+            return False
         model, delay_ns = self.cameras[camera], self._delays_ns.get(camera, 0)
         frame: Markers = message.payload
         for marker in frame.markers:
@@ -293,17 +286,23 @@ class DeviationStream:
                 self._newest_ns = max(self._newest_ns, time_ns)
         number = message.log_time_ns // STEP_NS
         before, self._number = self._number, max(number, self._number or 0)
-        if before is not None and number > before:
-            yield self._end_step(rig, number * STEP_NS)
+        return before is not None and number > before
 
-    def _end_step(self, rig: Rig, time_ns: int) -> Step:
-        deviations = [
-            one for camera, rows in self._waiting.items() for one in self._observe(rig, camera, rows)
-        ]
-        self._waiting.clear()
+    def finish_step(self) -> Iterator[Step | None]:
+        """Yield the step of the markers so far; None before it are pauses, in which others can work."""
+        assert self.rig is not None
+        assert self._number is not None
+        waiting, self._waiting = self._waiting, {}
         first_ns, self._done_ns = self._done_ns, max(self._newest_ns - _DELAY_NS, self._done_ns)
-        deviations = [*find_deviations(self._sightings, first_ns, self._done_ns), *deviations]
-        return Step(time_ns, self._done_ns, deviations)
+        step = Step(self._number * STEP_NS, self._done_ns, [])
+        for camera, rows in waiting.items():
+            step.deviations += self._observe(self.rig, camera, rows)
+            yield None
+        for number, camera in enumerate(sorted(self._sightings)):
+            others = sorted(self._sightings)[:number]
+            step.deviations += _find_deviations(self._sightings, camera, others, first_ns, step.last_ns)
+            yield None
+        yield step
 
     def _observe(self, rig: Rig, camera: str, rows: Sequence[tuple[int, Marker]]) -> Iterator[Deviation]:
         """Linearise the new sightings of a camera; yield the deviations of its reference markers."""

@@ -75,7 +75,7 @@ class ModelPart:
 MODEL_PARTS = {
     "rigid": ModelPart(_rigid, version=1, min_pairs=3),
     "poly": ModelPart(_poly, version=1, min_pairs=10),
-    "ann": ModelPart(_ann, version=1, min_pairs=10),
+    "ann": ModelPart(_ann, version=2, min_pairs=10),
     "kriging": ModelPart(_kriging, version=2, min_pairs=6),
     "kriging-regression": ModelPart(lambda: _kriging(noisy=True), version=2, min_pairs=6),
     "rayplane": ModelPart(_ray_plane, version=3, min_pairs=5, reads_height=True),

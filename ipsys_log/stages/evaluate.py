@@ -46,7 +46,7 @@ def _plan(view: StageView, options: Mapping[str, str]) -> Plan | str:
 
 STAGE = Stage(
     name="evaluate",
-    versions={"evaluate": 4},
+    versions={"evaluate": 5},
     reads=(*JOINT_READS, MODEL, TRUTH),
     writes=(EVALUATION,),
     plan=_plan,

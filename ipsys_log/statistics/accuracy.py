@@ -1,15 +1,32 @@
 """Errors of models on held-out and cross-validated points (eq. 26, 27), and their statistics."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from functools import cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ipsys_log.messages import Array, CameraEvaluation, ErrorStatistics, Model, Pair, Residual
-from ipsys_log.models.table import AppliedModel, reads_height
+from ipsys_log.models.rays import CalibrationPoints
+from ipsys_log.models.table import AppliedModel, min_pairs, reads_height
 from ipsys_log.statistics.calibration_points import level_cameras
-from ipsys_log.statistics.camera_models import fit_camera_models, height_sigmas, tape_covariances
-from ipsys_log.statistics.cross_validation import FOLDS, cross_validate, gather_points, make_folds
+from ipsys_log.statistics.camera_models import (
+    Without,
+    describe_camera_models,
+    height_sigmas,
+    predict_without_groups,
+    tape_covariances,
+)
+from ipsys_log.statistics.cross_validation import (
+    FOLDS,
+    Predict,
+    cross_validate,
+    fit_without,
+    gather_points,
+    leave_out,
+    make_folds,
+    predict_points,
+)
 from ipsys_log.statistics.remaining_error import with_remaining_error
 from ipsys_log.vision.trilateration import USUAL_TAPE_SCALE_SIGMA
 
@@ -168,33 +185,55 @@ def evaluate_cross_validated(
         Too few calibration points remain for the fit of a fold.
     """
     cameras = gather_points(pairs)
-    predicted = cross_validate(model.name, cameras, seed)
+    fit = cache(partial(fit_without, model.name, cameras))
+
+    def predict(left_out: Collection[str]) -> dict[str, Array]:
+        return predict_points(model.name, fit(frozenset(left_out)), cameras)
+
+    predicted = cross_validate(model.name, cameras, seed, predict)
     predictions = {camera: (list(pairs[camera]), predicted[camera]) for camera in cameras}
-    covariances = _fold_covariances(model.name, pairs, seed)
-    return error_rows(model, predictions, covariances, ground_truth, CROSS_VALIDATION)
-
-
-def _fold_covariances(name: str, pairs: Mapping[str, Sequence[Pair]], seed: int) -> dict[str, Array | None]:
-    """Return covariances (n, 3, 3) of the predictions of the first repeat, by camera; None if unknown."""
-    cameras = gather_points(pairs)
+    folds = make_folds(cameras, FOLDS, np.random.default_rng(seed))
     covariances: dict[str, Array | None] = {
         camera: np.full((len(places.names), 3, 3), np.nan) for camera, places in cameras.items()
     }
-    for fold in make_folds(cameras, FOLDS, np.random.default_rng(seed)):
-        rest = {
-            camera: [pair for pair in pairs[camera] if pair.measurement not in fold] for camera in cameras
-        }
-        for model in fit_camera_models(name, gather_points(rest), rest):
-            own = list(pairs[model.camera])
-            rows = [n for n, pair in enumerate(own) if pair.measurement in fold]
-            known, whole = None, covariances[model.camera]
+    for fold in folds:
+        without = _predict_without_folds(model.name, cameras, fold, folds, predict)
+        rest = {c: [pair for pair in pairs[c] if pair.measurement not in fold] for c in cameras}
+        for camera in describe_camera_models(model.name, gather_points(rest), rest, fit(fold), without):
+            rows = [n for n, pair in enumerate(pairs[camera.camera]) if pair.measurement in fold]
+            whole = covariances[camera.camera]
             if rows and whole is not None:
-                known = _covariances(AppliedModel(name, model), [own[n] for n in rows])
+                known = _covariances(
+                    AppliedModel(model.name, camera), [pairs[camera.camera][n] for n in rows]
+                )
                 if known is None:
-                    covariances[model.camera] = None
+                    covariances[camera.camera] = None
                 else:
                     whole[rows] = known
-    return covariances
+    return error_rows(model, predictions, covariances, ground_truth, CROSS_VALIDATION)
+
+
+def _predict_without_folds(
+    name: str,
+    cameras: Mapping[str, CalibrationPoints],
+    fold: frozenset[str],
+    folds: Sequence[frozenset[str]],
+    predict: Predict,
+) -> Without:
+    """Return the other folds, and predictions without a fold and each of them: two folds share one fit.
+
+    With few calibration points, the groups are smaller.
+    """
+    rest = {camera: leave_out(places, fold) for camera, places in cameras.items()}
+    others = [other for other in folds if other != fold]
+    fewest = min(len(leave_out(places, one).names) for places in rest.values() for one in others)
+    if fewest < min_pairs(name):
+        return predict_without_groups(name, rest)
+    predicted = {}
+    for camera, places in cameras.items():
+        rows = [name not in fold for name in places.names]
+        predicted[camera] = np.array([predict(fold | other)[camera][rows] for other in others])
+    return others, predicted
 
 
 def _covariances(applied: AppliedModel, pairs: Sequence[Pair]) -> Array | None:

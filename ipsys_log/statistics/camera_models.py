@@ -47,8 +47,23 @@ def fit_camera_models(
     FitError
         The calibration points do not determine a model.
     """
-    models = fit_cameras(name, cameras)
-    without = _predict_without_groups(name, cameras, progress)
+    without = predict_without_groups(name, cameras, progress)
+    return describe_camera_models(name, cameras, pairs, fit_cameras(name, cameras), without)
+
+
+# Groups of measurements, and for each camera the predictions (g, n, 3) for all its n calibration points by
+# models that are fitted without each group; None for too few calibration points.
+Without = tuple[Sequence[frozenset[str]], Mapping[str, Array]] | None
+
+
+def describe_camera_models(
+    name: str,
+    cameras: Mapping[str, CalibrationPoints],
+    pairs: Mapping[str, Sequence[Pair]],
+    models: Mapping[str, Any],
+    without: Without,
+) -> list[CameraModel]:
+    """Return fitted models of cameras with the covariances of :func:`fit_camera_models`."""
     fitted = []
     for camera, places in cameras.items():
         arrays = parameters(models[camera])
@@ -57,10 +72,10 @@ def fit_camera_models(
         )
         covariance, noise = None, None
         if without is not None:
-            residuals, groups = _left_out(places, without[0], without[1][camera])
+            residuals, group_of = _left_out(places, without[0], without[1][camera])
             covariance = residuals.T @ residuals / len(residuals) + _FLOOR_SIGMA_M**2 * np.eye(3)
             tape_m2 = tape_covariances(pairs[camera])
-            noise = _noise(name, models[camera], places, tape_m2, without[1][camera], groups)
+            noise = _noise(name, models[camera], places, tape_m2, without[1][camera], group_of)
         fitted.append(CameraModel(camera, stored, covariance, tuple(pairs[camera]), noise))
     return fitted
 
@@ -76,13 +91,12 @@ def height_sigmas(pairs: Sequence[Pair]) -> Array:
     return ruler_sigmas(tape_covariances(pairs))
 
 
-def _predict_without_groups(
-    name: str, cameras: Mapping[str, CalibrationPoints], progress: Callable[[int, int], None]
-) -> tuple[list[frozenset[str]], dict[str, Array]] | None:
-    """Return the groups, and predictions of models fitted without each group, (g, n, 3) by camera.
-
-    The result is None for too few calibration points.
-    """
+def predict_without_groups(
+    name: str,
+    cameras: Mapping[str, CalibrationPoints],
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Without:
+    """Return random groups of measurements, and predictions without each group."""
     fewest = min(len(places.names) for places in cameras.values())
     if fewest <= min_pairs(name):
         return None

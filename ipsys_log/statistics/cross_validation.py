@@ -3,6 +3,7 @@
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,8 +77,20 @@ def predict_without(
     FitError
         Too few calibration points remain.
     """
-    rest = {camera: leave_out(places, left_out) for camera, places in cameras.items()}
-    models = fit_cameras(name, rest)
+    return predict_points(name, fit_without(name, cameras, left_out), cameras)
+
+
+def fit_without(
+    name: str, cameras: Mapping[str, CalibrationPoints], left_out: Collection[str]
+) -> dict[str, Any]:
+    """Return the models of cameras, fitted without some calibration points; for errors see above."""
+    return fit_cameras(name, {camera: leave_out(places, left_out) for camera, places in cameras.items()})
+
+
+def predict_points(
+    name: str, models: Mapping[str, Any], cameras: Mapping[str, CalibrationPoints]
+) -> dict[str, Array]:
+    """Return the predictions of fitted models for calibration points, (n, 3) in m by camera."""
     return {
         camera: predict_array(models[camera], inputs(name, places.points_m, places.world_m[:, 2]))
         for camera, places in cameras.items()
@@ -172,6 +185,8 @@ def _each_left_out(
 _SIZES = (5, 7, 10, 15, 20, 30, 40, 60, 80, 120, 160, 240)
 
 
+# A mean error of a learning curve is certain enough if this share of it is its standard error.
+_CERTAIN = 0.1
 # Least number of held-out points for an error.
 _LEAST_REST = 5
 
@@ -199,20 +214,30 @@ def learning_curve(
     cameras : all calibration points; the errors are those at the points that are not in a subset.
     seed : random seed of the subsets.
     predict : predictions of a fit to some points; None for those of :func:`predict_without`.
-    subsets : number of subsets of each size.
+    subsets : the largest number of subsets of each size. Half of them are enough if the standard error of
+        each mean error is then at most a tenth of it.
     """
     predict = predict or partial(predict_without, name, cameras)
     rng = np.random.default_rng(seed)
     points = sorted({point for places in cameras.values() for point in places.point_names})
     for size in learning_sizes(name, cameras):
         errors: dict[str, list[tuple[float, float]]] = {camera: [] for camera in cameras}
-        for _ in range(subsets):
-            order = rng.permutation(points).tolist()
+        for order in [rng.permutation(points).tolist() for _ in range(subsets)]:
             used = {point for places in cameras.values() for point in _first(places, order, size)}
             left_out = set(_measurements(cameras, set(points) - used))
             for camera, means_m in _errors(predict, cameras, left_out, left_out).items():
                 errors[camera].append(means_m)
+            if all(_is_enough(np.array(rows), subsets) for rows in errors.values()):
+                break
         yield [_point(camera, size, np.array(rows)) for camera, rows in errors.items() if rows]
+
+
+def _is_enough(errors_m: Array, subsets: int) -> bool:
+    """Return whether the means of errors (n, 2) of n subsets are certain enough."""
+    if len(errors_m) < max(2, subsets / 2):
+        return False
+    standard_m = errors_m.std(axis=0, ddof=1) / np.sqrt(len(errors_m))
+    return bool((standard_m <= _CERTAIN * errors_m.mean(axis=0)).all())
 
 
 def _point(camera: str, size: int, errors_m: Array) -> LearningPoint:

@@ -211,8 +211,7 @@ def test_blocks_give_the_same_motions_of_cameras(
     motions = []
     for one in (problem, problem_without_blocks(problem)):
         normal = one.linearise(state, 1.0)
-        factors = Factorisation(normal, one.layout.free)
-        solution = Solution(state, normal.cost, normal, factors, 1)
+        solution = Solution(one, state, normal.cost, 1)
         fit = JointFit(observations, JointSettings(), one, solution, np.zeros((0, 0)))
         squares = sum_squares(fit)
         found = [find_motion(squares, camera) for camera in range(len(observations.cameras))]

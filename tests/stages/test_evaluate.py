@@ -13,14 +13,14 @@ from scipy.stats import chi2
 from ipsys_log.errors import FitError
 from ipsys_log.messages import Distance, Evaluation, Measurement, Message, Pair, Track, Tracks
 from ipsys_log.models.rays import CalibrationPoints
-from ipsys_log.models.table import AppliedModel, group_dependent_cameras, min_pairs
+from ipsys_log.models.table import AppliedModel, fit_cameras, group_dependent_cameras, min_pairs
 from ipsys_log.statistics.accuracy import (
     POOLED,
     error_statistics,
     evaluate_cross_validated,
     evaluate_held_out,
 )
-from ipsys_log.statistics.camera_models import fit_model, height_sigmas
+from ipsys_log.statistics.camera_models import describe_camera_models, fit_model, height_sigmas
 from ipsys_log.statistics.cross_validation import (
     FOLDS,
     Study,
@@ -188,9 +188,13 @@ def test_cross_validated_errors_are_compared_with_the_model_of_their_fold() -> N
     model = fit_model("poly", {"red": found}, 0)
     (row,) = evaluate_cross_validated(model, {"red": found}, {}, seed=7)
     within = 0
-    for fold in make_folds(gather_points({"red": found}), FOLDS, np.random.default_rng(7)):
-        rest = [p for p in found if p.measurement not in fold]
-        applied = AppliedModel("poly", fit_model("poly", {"red": rest}, 0).cameras[0])
+    folds = make_folds(gather_points({"red": found}), FOLDS, np.random.default_rng(7))
+    for fold in folds:
+        rest = {"red": [p for p in found if p.measurement not in fold]}
+        cameras, others = gather_points(rest), [other for other in folds if other != fold]
+        without = others, {"red": np.array([predict_without("poly", cameras, o)["red"] for o in others])}
+        fitted = fit_cameras("poly", cameras)
+        applied = AppliedModel("poly", *describe_camera_models("poly", cameras, rest, fitted, without))
         for pair in (p for p in found if p.measurement in fold):
             point, height = pair.camera_m[None], pair.world_m[2:]
             covariances = applied.covariances(point, height)
@@ -298,7 +302,8 @@ def test_learning_curve_falls_with_more_points() -> None:
     curve = [p for points in learning_curve("poly", gather_points({"red": found}), 0) for p in points]
     assert [p.pairs for p in curve] == [10, 15, 20, 30, 40]
     assert curve[0].mean_3d_m > 3 * curve[-1].mean_3d_m
-    assert all(p.std_3d_m is not None and p.subsets == 10 for p in curve)
+    assert [p.subsets for p in curve] == [10, 10, 5, 5, 5]
+    assert all(p.std_3d_m <= 0.1 * p.subsets**0.5 * p.mean_3d_m for p in curve if p.subsets < 10)
 
 
 def test_published_subsets_are_evaluated_as_in_the_paper() -> None:

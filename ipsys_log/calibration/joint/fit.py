@@ -20,7 +20,14 @@ from ipsys_log.calibration.joint.sighting_factors import (
     at_one_instant,
     make_sighting_factors,
 )
-from ipsys_log.calibration.joint.solver import SHORT, ConvergenceError, Solution, solve
+from ipsys_log.calibration.joint.solver import (
+    COLD_DAMPING,
+    SHORT,
+    WARM_DAMPING,
+    ConvergenceError,
+    Solution,
+    solve,
+)
 from ipsys_log.calibration.joint.start import PlacedCamera, UnplacedError, place_cameras, rough_points
 from ipsys_log.calibration.joint.trajectories import Kind, Trajectories
 from ipsys_log.errors import FitError
@@ -173,7 +180,7 @@ def refit_without(
     )
     state = replace(fit.state, positions_m=fit.state.positions_m[kept], turns=fit.state.turns[kept])
     try:
-        return _solve(observations, fit.settings, problem, state, progress, _NEAR)
+        return _solve(observations, fit.settings, problem, state, progress, _NEAR, WARM_DAMPING)
     except ConvergenceError as error:
         raise explain_divergence(error, observations) from error
 
@@ -268,8 +275,10 @@ def _solve(
     state: State,
     progress: Callable[[int, float], None],
     short: float = SHORT,
+    damping: float = COLD_DAMPING,
 ) -> JointFit:
-    solution = solve(problem, state, progress, short, follows_valleys=settings.follows_valleys)
+    valleys = settings.follows_valleys
+    solution = solve(problem, state, progress, short, follows_valleys=valleys, damping=damping)
     return JointFit(observations, settings, problem, solution, solution.factorisation.global_covariance())
 
 

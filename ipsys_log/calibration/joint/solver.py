@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -16,7 +17,9 @@ from ipsys_log.calibration.joint.problem import Problem
 from ipsys_log.errors import FitError
 from ipsys_log.messages import Array
 
-_FIRST_DAMPING = 1e-4
+COLD_DAMPING = 1e-4
+# The same near the optimum, where more damping only slows the weak directions.
+WARM_DAMPING = 1e-8
 # Limits of the damping.
 _LEAST_DAMPING = 1e-12
 _MOST_DAMPING = 1e8
@@ -36,6 +39,7 @@ _NOT_CONVERGED = (
     f"the joint fit did not converge in {_MOST_STEPS} steps; look at the residuals of the sightings, and "
     "remove wrong measurements"
 )
+_UNDETERMINED = "the observations do not determine the cameras; add calibration points, spread over the floor"
 # The strict loss; before it, fits move fast.
 _STRICT = 1.0
 # Dampings of a leap, from the least to the most by this factor: the least one that leads on is taken.
@@ -60,15 +64,27 @@ class ConvergenceError(FitError):
         self.problem, self.state = problem, state
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Solution:
-    """The state of least cost, its normal equations and their factors, and the number of steps."""
+    """The state of least cost, the number of steps, and the normal equations and their factors."""
 
+    problem: Problem
     state: State
     cost: float
-    normal: NormalEquations
-    factorisation: Factorisation
     steps: int
+
+    @cached_property
+    def normal(self) -> NormalEquations:
+        """The normal equations at the state."""
+        return self.problem.linearise(self.state, _STRICT)
+
+    @cached_property
+    def factorisation(self) -> Factorisation:
+        """Their factors; FitError if the observations do not determine the unknowns."""
+        try:
+            return Factorisation(self.normal, self.problem.layout.free)
+        except np.linalg.LinAlgError as error:
+            raise FitError(_UNDETERMINED) from error
 
 
 def solve(
@@ -78,6 +94,7 @@ def solve(
     short: float = SHORT,
     patient: bool = False,
     follows_valleys: bool = True,
+    damping: float = COLD_DAMPING,
 ) -> Solution:
     """Minimise the cost of a problem, from a start.
 
@@ -94,6 +111,7 @@ def solve(
         points before each step. In a hall, the sightings fit long before the cameras fit to the few measured
         points, which would then count as outliers.
     follows_valleys : whether long steps along a curved valley follow the usual ones; they may take minutes.
+    damping : of the first step.
 
     Raises
     ------
@@ -105,7 +123,7 @@ def solve(
     Triggs, McLauchlan, Hartley and Fitzgibbon, Bundle adjustment - a modern synthesis, 2000.
     """
     state = anchor(problem, state) if patient else state
-    ease, damping, last_cost = problem.ease(state), _FIRST_DAMPING, np.inf
+    ease, last_cost = problem.ease(state), np.inf
     normal = problem.linearise(state, ease)
     for step in range(_MOST_STEPS):
         state, cost, decrement, damping = _descend(problem, state, normal, damping, ease)
@@ -119,7 +137,7 @@ def solve(
         long = short if ease == 1.0 else _ROUGH
         settled = stalled or decrement <= long**2
         if settled and ease == 1.0:
-            return _finish(problem, state, cost, step + 1)
+            return Solution(problem, state, cost, step + 1)
         if ease > 1.0 and (settled or (step % 3 == 2 and not patient)):
             ease = min(ease, problem.ease(state))
             # The last stage is strict, even if more than half of the sightings have errors above the noise.
@@ -128,7 +146,7 @@ def solve(
         normal = problem.linearise(state, ease)
     if ease == 1.0 and decrement <= _TOLERABLE**2:
         # Outliers at the limit of the loss slow the last steps, without an effect on the result.
-        return _finish(problem, state, cost, _MOST_STEPS)
+        return Solution(problem, state, cost, _MOST_STEPS)
     if ease == 1.0 and follows_valleys:
         return _follow_valley(problem, state, normal, progress, short)
     raise ConvergenceError(_NOT_CONVERGED, problem, state)
@@ -180,14 +198,9 @@ def _follow_valley(
         state, cost, decrement = leap
         progress(step + 1, cost)
         if decrement <= short**2:
-            return _finish(problem, state, cost, step + 1)
+            return Solution(problem, state, cost, step + 1)
         normal = problem.linearise(state, 1.0)
     raise ConvergenceError(_NOT_CONVERGED, problem, state)
-
-
-def _finish(problem: Problem, state: State, cost: float, steps: int) -> Solution:
-    normal = problem.linearise(state, 1.0)
-    return Solution(state, cost, normal, _factorise(problem, normal), steps)
 
 
 def _descend(
@@ -206,7 +219,7 @@ def _descend(
             cost = problem.cost(trial, ease) if problem.permits(trial) else np.inf
         if np.isfinite(cost) and cost <= normal.cost:
             # A short step by strong damping is no sign of a minimum.
-            decrement = expected if damping <= _FIRST_DAMPING else np.inf
+            decrement = expected if damping <= COLD_DAMPING else np.inf
             # Weak directions converge only without damping: a step as good as expected ends it soon.
             relief = 100.0 if normal.cost - cost > 0.25 * expected else 3.0
             return trial, cost, decrement, max(damping / relief, _LEAST_DAMPING)
@@ -218,19 +231,8 @@ def _descend(
 
 def _more(damping: float) -> float:
     if damping >= _MOST_DAMPING:
-        raise FitError(
-            "the observations do not determine the cameras; add calibration points, spread over the floor"
-        )
+        raise FitError(_UNDETERMINED)
     return max(damping * 8, 1e-8)
-
-
-def _factorise(problem: Problem, normal: NormalEquations) -> Factorisation:
-    try:
-        return Factorisation(normal, problem.layout.free)
-    except np.linalg.LinAlgError as error:
-        raise FitError(
-            "the observations do not determine the cameras; add calibration points, spread over the floor"
-        ) from error
 
 
 def _leap_along_valley(

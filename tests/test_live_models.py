@@ -46,7 +46,8 @@ def recorded(lab_log: Path, fitted: Path, tmp_path_factory: pytest.TempPathFacto
     assert [(one.stage, one.run) for one in outcomes] == [
         ("detect", "edges"),
         ("camera-frame", "edges"),
-        *[(stage, model) for model in MODELS for stage in ("fit", "locate", "fuse")],
+        *[(stage, "poly") for stage in ("fit", "locate", "fuse")],
+        *[(stage, "joint") for stage in ("fit", "watch", "locate", "fuse")],
     ]
     return target
 

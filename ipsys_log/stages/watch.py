@@ -9,14 +9,11 @@ from itertools import chain
 
 import numpy as np
 
-from ipsys_log.calibration.joint.payload import find_motion, restore_joint
 from ipsys_log.messages import CameraPose, CameraPoses, Event, Markers, Message, Model
 from ipsys_log.messages.channels import CAMERA_POSES, MARKERS, MODEL, RIG, RUN_EVENTS
 from ipsys_log.messages.models import MOVED, PARTLY, REPAIRED
-from ipsys_log.messages.stage import Plan, Stage, StageView, Timed, model_read
+from ipsys_log.messages.stage import Plan, Stage, StageView, Step, Timed, model_read
 from ipsys_log.models.table import reads_corners
-from ipsys_log.statistics.camera_watch import WatchCameras
-from ipsys_log.statistics.deviations import STEP_NS
 from ipsys_log.statistics.model_kinds import model_kind
 
 # States of poses that last beyond the search for a cause.
@@ -28,6 +25,11 @@ def repair_afterwards(view: StageView, model: Model) -> list[Timed]:
 
     The last estimate of each motion counts. Around the instant itself, the pose is not known.
     """
+    # Late: scipy takes 1 s, and most commands need no joint model.
+    from ipsys_log.calibration.joint.payload import find_motion, restore_joint
+    from ipsys_log.statistics.camera_watch import WatchCameras
+    from ipsys_log.statistics.deviations import STEP_NS
+
     watch, rows, poses = WatchCameras(model, True), list[Timed](), dict[tuple[int, str], CameraPose]()
     rigs = [view.rig] if view.rig is not None else view.payloads(RIG)[:1]
     first = [Message(RIG.topic, 0, 0, rig) for rig in rigs]
@@ -64,7 +66,13 @@ def _plan(view: StageView, options: Mapping[str, str]) -> Plan | str:
     plan = Plan(run=view.run(MODEL), parameters=parameters, reads=(RIG, MARKERS, MODEL))
     if parameters.get("self_calibrate") == "afterwards":
         return replace(plan, compute=lambda progress: repair_afterwards(view, model))
-    return replace(plan, step=lambda run: WatchCameras(model, bool(parameters)))
+    return replace(plan, step=lambda run: _step(model, bool(parameters)))
+
+
+def _step(model: Model, self_calibrate: bool) -> Step:
+    from ipsys_log.statistics.camera_watch import WatchCameras
+
+    return WatchCameras(model, self_calibrate)
 
 
 STAGE = Stage(

@@ -46,6 +46,8 @@ _CERTAIN_M, _BETTER = 4e-4, 0.2
 # A repair with a larger mean square of its residuals is refused: no motion of the camera explains them.
 _MOST_MISFIT = 4.0
 _FEWEST_DEVIATIONS = 20
+# Variances of a motion that no number of deviations reduces: warmth and light, in rad^2 and m^2.
+_LEAST_COVARIANCE = np.diag(np.repeat([1e-5, 3e-5], 3) ** 2)
 # With a larger error of the first estimate, the slopes are wrong: the repair begins again.
 _LINEAR_M = 5e-4
 _NEVER_NS = 2**62
@@ -338,7 +340,7 @@ class WatchCameras:
             elif is_last or moved.state != MOVED:
                 yield from self._refuse(camera, moved)
             return
-        covariance = repair.covariance * max(repair.misfit, 1.0)
+        covariance = repair.covariance * max(repair.misfit, 1.0) + _LEAST_COVARIANCE
         sigma_m = self._floors[camera].mean_sigma(covariance)
         is_certain = sigma_m < _CERTAIN_M
         if not (is_certain or is_last or sigma_m < _BETTER * moved.shift_m):

@@ -28,8 +28,9 @@ _SHARE, _SCALES = 0.005, (0.25, 25.0)
 
 # Passes over a place whose mean is its first deviation, for slow changes; and passes since then.
 _FIRST_PASSES = 5
-# Standard deviations of a slow motion of a camera: turn about each axis in rad, and shift along each in m.
-_SLOW = np.repeat([2e-3, 2e-3], 3)
+# Standard deviations of a slow motion of a camera where no deviation shows it: turn about each axis in rad,
+# and shift along each in m.
+_SLOW = np.repeat([3e-4, 3e-4], 3)
 _MOTION = 6
 _KINDS = {kind.name: kind for kind in (PAIR, RISE, REFERENCE)}
 

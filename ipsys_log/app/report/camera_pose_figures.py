@@ -198,7 +198,7 @@ def draw_drift(reading: DriftReading, path: Path) -> None:
     axes.xaxis.set_major_formatter(ConciseDateFormatter(locator))  # type: ignore[no-untyped-call]
     axes.set(ylabel="mean shift of the floor map in mm", ylim=(0, None))
     axes.set_title(
-        f"Drift of the cameras since {shorten(reading.names[0])}; bands: 95 %", loc="left", fontsize=11
+        f"Drift of the cameras since {shorten(reading.since)}; bands: 95 %", loc="left", fontsize=11
     )
     style_axes(axes)
     columns = -(-len(drift.baselines) // _LEGEND_ROWS)

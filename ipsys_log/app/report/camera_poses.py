@@ -273,7 +273,7 @@ def drift_table(reading: DriftReading) -> Rows:
         if states:
             time = format_time(min(state.time_ns for state in states.values()))[:16]
             cells.append([name, time, *(_cell(states.get(camera)) for camera in cameras)])
-    title = f"Mean shift of the floor maps since {reading.names[0]}, in mm"
+    title = f"Mean shift of the floor maps since {reading.since}, in mm"
     return Rows(title, ("log", "end (UTC)", *(f">{camera}" for camera in cameras)), cells)
 
 

@@ -1,7 +1,7 @@
 """Reading of logs for the drift of their cameras, with the checks of the input."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -12,10 +12,10 @@ from ipsys_log.engine.provenance import newest_run
 from ipsys_log.errors import IpsysError
 from ipsys_log.log.dataset import Session
 from ipsys_log.log.location import LogLocation
-from ipsys_log.messages import CameraPose, CameraPoses, Message, Model, Rig
+from ipsys_log.messages import Array, CameraPose, CameraPoses, Event, Message, Model, Rig
 from ipsys_log.messages.channels import MARKERS, RIG
 from ipsys_log.messages.events import MARKER_MOVED
-from ipsys_log.messages.models import MOVED
+from ipsys_log.messages.models import MOVED, PARTLY, REPAIRED
 from ipsys_log.models.table import reads_corners
 from ipsys_log.plain_text import shell_words
 from ipsys_log.statistics.camera_moves import (
@@ -34,6 +34,9 @@ from ipsys_log.statistics.drift import DriftBaseline, Motion
 from ipsys_log.statistics.floor_cameras import read_floor_cameras
 from ipsys_log.vision.poses import PosedCamera
 
+# States of the cameras that are noted over a log that is watched.
+_STATES = 12
+
 
 @dataclass(slots=True, eq=False)
 class DriftReading:
@@ -44,6 +47,7 @@ class DriftReading:
     paths, names : the logs in order of time, and their short names; the first is the baseline.
     model : name of the model with the camera poses; ``source`` are its log and its topic.
     remarks : on logs that were left out, and others.
+    since : the state that motions refer to.
     """
 
     drift: LabDrift
@@ -52,6 +56,7 @@ class DriftReading:
     model: str
     source: tuple[LogLocation, str]
     remarks: list[str] = field(default_factory=list)
+    since: str = ""
 
     def moved(self) -> dict[str, Motion]:
         """Return the motions since the baseline of the cameras that have moved at the end of the logs."""
@@ -102,7 +107,8 @@ def read_drift(
     ]
     if len(read) == 1:
         remarks.append("one log shows only moves during its recording; add earlier logs")
-    return DriftReading(drift, kept, [log.name for log in windows], model, source, remarks)
+    names = [log.name for log in windows]
+    return DriftReading(drift, kept, names, model, source, remarks, names[0])
 
 
 def _has_references(path: LogLocation, rig: Rig | None) -> bool:
@@ -120,35 +126,70 @@ def _watch_logs(
 ) -> DriftReading:
     """Find the moves of the cameras from robots that drive, without reference markers."""
     model, source, cameras = _find_joint_model([model_from] if model_from else paths, _start_ns(paths[0]))
-    watch, fitted, drift = WatchCameras(model, True), restore_joint(model), LabDrift()
-    drift.baselines = {name: DriftBaseline(one, np.empty((0, 3)), {}, {}) for name, one in cameras.items()}
-    names, before = list[str](), ("", 0)
-    for number, path in enumerate(paths):
+    history = _History(WatchCameras(model, True), restore_joint(model))
+    history.drift.baselines = {
+        name: DriftBaseline(one, np.empty((0, 3)), {}, {}) for name, one in cameras.items()
+    }
+    names = [path.name if [p.name for p in paths].count(path.name) == 1 else str(path) for path in paths]
+    for number, (path, name) in enumerate(zip(paths, names, strict=True)):
         progress(number, len(paths))
-        name = path.name if [other.name for other in paths].count(path.name) == 1 else str(path)
-        names.append(name)
-        poses: dict[tuple[int, str], CameraPose] = {}
-        with Session([path]) as session:
-            start_ns = session.start_ns
-            for message in _marker_messages(session, rig):
-                for payload in watch(message):
-                    if isinstance(payload, CameraPoses):
-                        poses.update(
-                            {(one.since, one.camera): one for one in payload.poses if one.state == MOVED}
-                        )
-                    elif payload.kind == MARKER_MOVED:
-                        drift.marker_moves.append(MarkerMove(payload.marker_id, payload.timestamp, name))
-        end_ns = message.publish_time_ns
-        states = {one: _motion(watch, fitted, one) for one in sorted(cameras)}
-        drift.states += [CameraState(one, name, end_ns, motion) for one, motion in states.items()]
-        for (since_ns, camera), _ in sorted(poses.items()):
-            motion, is_between = states[camera], bool(before[0]) and since_ns < start_ns + STEP_NS
-            if motion is not None:
-                first = before if is_between else (name, since_ns)
-                drift.moves.append(Move(camera, first[1], since_ns + STEP_NS, first[0], name, motion))
-        before = name, end_ns
+        history.add(path, name, rig)
     progress(len(paths), len(paths))
-    return DriftReading(drift, list(paths), names, model.name, source, remarks)
+    return DriftReading(history.drift, list(paths), names, model.name, source, remarks, "the calibration")
+
+
+@dataclass(slots=True, eq=False)
+class _History:
+    """The watch over logs in order of time, and its findings; ``before`` are the last log and its end."""
+
+    watch: WatchCameras
+    fitted: Mapping[str, JointModel]
+    drift: LabDrift = field(default_factory=LabDrift)
+    before: tuple[str, int] | None = None
+
+    def add(self, path: LogLocation, name: str, rig: Rig | None) -> None:
+        """Watch the cameras in the next log."""
+        poses: dict[tuple[int, str], list[CameraPose]] = {}
+        with Session([path]) as session:
+            first_ns = start_ns = session.start_ns
+            step_ns = max((session.end_ns - start_ns) // _STATES, STEP_NS)
+            for message in _marker_messages(session, rig):
+                for payload in self.watch(message):
+                    for pose in payload.poses if isinstance(payload, CameraPoses) else ():
+                        if pose.state in (MOVED, PARTLY, REPAIRED):
+                            poses.setdefault((pose.since, pose.camera), []).append(pose)
+                    if isinstance(payload, Event) and payload.kind == MARKER_MOVED:
+                        move = MarkerMove(int(payload.marker_id or 0), payload.timestamp, name)
+                        self.drift.marker_moves.append(move)
+                end_ns = message.publish_time_ns
+                if end_ns > start_ns + step_ns:
+                    self._note_states(name, end_ns)
+                    start_ns += step_ns
+        self._note_states(name, end_ns)
+        for (since_ns, camera), own in sorted(poses.items()):
+            joint, covariance = self.fitted[camera], own[-1].covariance
+            old, new = (
+                replace(joint, origin_m=p.position_m, camera_from_world=p.camera_from_world)
+                for p in (own[0], own[-1])
+            )
+            motion = self._motion(camera, find_motion(old, new), covariance)
+            is_between = self.before is not None and since_ns < first_ns + STEP_NS
+            first = self.before if is_between and self.before else (name, since_ns)
+            self.drift.moves.append(Move(camera, first[1], since_ns + STEP_NS, first[0], name, motion))
+        self.before = name, end_ns
+
+    def _note_states(self, name: str, time_ns: int) -> None:
+        for camera, (model, covariance) in sorted(self.watch.poses().items()):
+            if self.watch.floor_of(camera) is not None:
+                motion = self._motion(camera, find_motion(self.fitted[camera], model), covariance)
+                self.drift.states.append(CameraState(camera, name, time_ns, motion))
+
+    def _motion(self, camera: str, motion: Array, covariance: Array) -> Motion:
+        floor = self.watch.floor_of(camera)
+        assert floor is not None
+        shift_m, sigma_m = floor.mean_shift(motion), floor.mean_sigma(covariance)
+        evidence = float(motion @ np.linalg.solve(covariance, motion))
+        return Motion(motion, covariance, shift_m, sigma_m, (), (), False, evidence, None)
 
 
 def _marker_messages(session: Session, rig: Rig | None) -> Iterator[Message]:
@@ -169,18 +210,6 @@ def _marker_messages(session: Session, rig: Rig | None) -> Iterator[Message]:
     yield from (Message(RIG.topic, start_ns, start_ns, one) for one in rigs)
     later = [] if rig is not None else session.topics(RIG)
     yield from session.messages([*later, *session.topics(MARKERS, run)])
-
-
-def _motion(watch: WatchCameras, fitted: Mapping[str, JointModel], camera: str) -> Motion | None:
-    """Return the motion of a camera since the calibration; None if it has no frame."""
-    floor = watch.floor_of(camera)
-    if floor is None:
-        return None
-    model, covariance = watch.poses()[camera]
-    motion = find_motion(fitted[camera], model)
-    shift_m, sigma_m = floor.mean_shift(motion), floor.mean_sigma(covariance)
-    evidence = float(motion @ np.linalg.solve(covariance, motion))
-    return Motion(motion, covariance, shift_m, sigma_m, (), (), False, evidence, None)
 
 
 def _find_joint_model(

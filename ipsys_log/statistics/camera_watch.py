@@ -212,7 +212,8 @@ class WatchCameras:
             pose = self._pose(camera, MOVED, self._done_ns, covariance)
             yield CameraPoses(self._done_ns, (pose,))
             text = (
-                f"camera {camera} was turned far, or exchanged: no marker is level; calibrate the lab again"
+                f"camera {camera} was turned far, zoomed, or exchanged: no marker is level at its height; "
+                "calibrate the lab again"
             )
             yield Event(self._done_ns, CAMERA_MOVED, text, camera, start=self._done_ns)
             self._moved[camera] = _Moved(self._done_ns, time_ns, _FAR_M, next_ns=_NEVER_NS)

@@ -20,6 +20,9 @@ _TILT_SIGMA_RAD = 0.005
 # With its height free, a level marker has four degrees of freedom left. A marker in a hand has larger
 # residuals.
 _MOST_CHI2 = 40.0
+# A marker that is further from its height is no robot: it lies at a calibration point. A camera that turns by
+# one degree shifts heights by up to 26 mm, and a zoom of 2 % by 42 mm.
+_MOST_RISE_M = 0.06
 _MOTION = 6
 
 
@@ -112,7 +115,8 @@ def observe_level(model: JointModel, seen: SeenMarkers, heights_m: Array) -> Lev
         -(gains[:, :2] @ now.by_pose[:, :, 2:3])[:, :, 0],
         variances,
     )
-    return everything.select(chi2 < _MOST_CHI2)  # False for NaN
+    # False for NaN.
+    return everything.select((chi2 < _MOST_CHI2) & (np.abs(everything.rises_m) < _MOST_RISE_M))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -39,8 +39,6 @@ _HEIGHT_SIGMA_M = JointSettings().robot_height_sigma_m
 # chance: with five degrees of freedom at a known height, and with two for a full pose.
 MOST_CHI2 = 37.0
 MOST_CHI2_OF_POSE = 27.6
-# Rounding errors of a variance.
-_ROUNDING = 1e-15
 # A height by the corners that differs by more than this multiple of its uncertainty contradicts the rig.
 _MOST_SIGMAS = 4.0
 
@@ -130,10 +128,9 @@ class LocateCorners:
         spreads = {name: pose.covariance for name, pose in self._poses.items() if pose.covariance.any()}
         for name, pose in self._poses.items():
             values = np.concatenate([pose.position_m, *pose.camera_from_world, *pose.covariance])
-            if not np.isfinite(values).all() or np.linalg.eigvalsh(pose.covariance)[0] < -_ROUNDING:
-                raise IpsysError(
-                    f"camera {name}: its pose in camera_poses is not valid; replay the log again"
-                )
+            is_spread = name not in spreads or np.linalg.eigvalsh(pose.covariance)[0] > 0
+            if not (np.isfinite(values).all() and is_spread):
+                raise IpsysError(f"camera {name}: its pose in the log is not valid; replay the log again")
         self._cameras.update(add_pose_modes(moved, spreads))
         if self._rig is not None:
             self._bodies.use_rig(self._rig)

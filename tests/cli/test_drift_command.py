@@ -17,7 +17,7 @@ from ipsys_log.calibration.joint.payload import restore_joint
 from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.engine.output import write_log
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import Floor, Model
+from ipsys_log.messages import Floor, Message, Model
 from ipsys_log.messages.channels import MODEL
 from ipsys_log.messages.rig_file import rig_toml
 from ipsys_log.statistics.floor_cameras import floor_grid, shift_floor_map
@@ -188,7 +188,13 @@ def test_bad_input_is_one_line(
         assert (done.code, done.err.count("\n")) == (1, 1), done.err
         return done.err
 
-    assert "add [[reference_markers]]" in error(calibration)
+    assert ipsys("drift", calibration).code == 0  # the joint model and robots show moves, too
+    plain = tmp_path / "plain.mcap"
+    with Session([weeks[1]]) as session:
+        (rig,) = session.payloads(["/rig"])
+        start_ns = session.start_ns
+    write_log(plain, [Message("/rig", start_ns, start_ns, replace(rig, reference_markers=()))])
+    assert "add [[reference_markers]]" in error(plain)
     assert "no fitted model" in error(*weeks[:2])
     own = lab()
     other = tmp_path / "other.mcap"

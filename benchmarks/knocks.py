@@ -32,13 +32,12 @@ from ipsys_log.calibration.joint.model import JointModel
 from ipsys_log.calibration.joint.payload import find_motion, joint_payload, move_camera, restore_joint
 from ipsys_log.capture.simulation.lab import EPOCH_NS
 from ipsys_log.capture.simulation.settings import LabSettings
-from ipsys_log.messages import CameraPoses, Event, Markers, Message, Model
+from ipsys_log.messages import CameraPoses, Event, Message, Model
 from ipsys_log.messages.models import MOVED, PARTLY, REPAIRED
 from ipsys_log.statistics.camera_watch import WatchCameras
 from ipsys_log.units import MM_PER_M, NS_PER_S
-from ipsys_log.vision.poses import rotation
-from tests.geometric.knocks import Disturbance, Place, disturb, drive_messages
-from tests.geometric.lab import GeometricLab, GeometricSettings, PlacedMarkers, build_lab
+from tests.geometric.knocks import Disturbance, disturb, drive_messages, keep_markers, lying
+from tests.geometric.lab import GeometricLab, GeometricSettings, build_lab
 
 _FIRST_SEED, _ROBOTS = 600, 4
 _KNOCK_S, _AFTER_S = 90.0, 66.0
@@ -162,26 +161,8 @@ def watch(model: Model, messages: Iterator[Message]) -> Iterator[tuple[float, ob
 def _messages(lab: GeometricLab, knock: Disturbance, row: Row) -> Iterator[Message]:
     if not row.references:
         return drive_messages(lab, [knock], 0.2)
-    fixed = {marker_id: _lying(*place) for marker_id, place in _REFERENCES.items()}
-    return _without_robots(drive_messages(lab, [knock], 0.2, fixed, list(fixed)))
-
-
-def _without_robots(messages: Iterator[Message]) -> Iterator[Message]:
-    for message in messages:
-        frame = message.payload
-        if isinstance(frame, Markers):
-            frame = replace(frame, markers=tuple(one for one in frame.markers if one.id in _REFERENCES))
-        yield replace(message, payload=frame)
-
-
-def _lying(x_m: float, y_m: float) -> Place:
-    turn = rotation(np.array([0.0, 0.0, x_m]))
-
-    def place(times_s: np.ndarray) -> PlacedMarkers:
-        count = len(times_s)
-        return PlacedMarkers(np.tile([x_m, y_m, 0.0], (count, 1)), np.tile(turn, (count, 1, 1)))
-
-    return place
+    fixed = {marker_id: lying(*place) for marker_id, place in _REFERENCES.items()}
+    return keep_markers(drive_messages(lab, [knock], 0.2, fixed, list(fixed)), fixed)
 
 
 def _error_mm(lab: GeometricLab, model: JointModel) -> float:
@@ -236,9 +217,9 @@ def _cells(trials: Sequence[Trial]) -> list[str]:
     ]
 
 
-def count_alarms(hours: float) -> str:
+def count_alarms(hours: float, robots: int) -> str:
     """Return the alarms in undisturbed drives on uneven floors, and the share of a core for the watch."""
-    row, drive_s, events, cost_s = ROWS[4], 1800.0, 0, 0.0
+    row, drive_s, events, cost_s = replace(ROWS[4], robots=robots), min(1800.0, 3600 * hours), 0, 0.0
     drives = max(round(hours * 3600 / drive_s), 1)
     for seed in range(_FIRST_SEED, _FIRST_SEED + drives):
         messages = list(drive_messages(build_lab(settings(seed, row, drive_s)), (), 0.2))
@@ -248,7 +229,7 @@ def count_alarms(hours: float) -> str:
         cost_s += time.process_time() - start_s
     share = 100 * cost_s / (drives * drive_s)
     hours = drives * drive_s / 3600
-    return f"{hours:g} h undisturbed, {_ROBOTS} robots: {events} events, {share:.1f} % of a core"
+    return f"{hours:g} h undisturbed, {robots} robots: {events} events, {share:.1f} % of a core"
 
 
 def _main() -> None:
@@ -258,10 +239,11 @@ def _main() -> None:
         "--rows", nargs="*", default=[], help="only rows whose names contain one of these texts"
     )
     parser.add_argument("--hours", type=float, default=0.0)
+    parser.add_argument("--robots", type=int, default=_ROBOTS, help="with --hours")
     given = parser.parse_args()
     rows = [row for row in ROWS if not given.rows or any(text in row.name for text in given.rows)]
     with threadpool_limits(1):
-        lines = [count_alarms(given.hours)] if given.hours else measure(rows, given.labs)
+        lines = [count_alarms(given.hours, given.robots)] if given.hours else measure(rows, given.labs)
     print("\n".join(lines))
 
 

@@ -420,6 +420,7 @@ def live(
     calibrations: Mapping[str, CameraCalibration] | None = None,
     corners: str | None = None,
     method: str = "perimeter",
+    self_calibrate: bool = False,
     force: bool = False,
     say: Callable[[str], None] = lambda text: None,
 ) -> Tracker:
@@ -434,7 +435,7 @@ def live(
     models : the old name of ``model``.
     cameras : only these cameras of the rig.
     calibrations : they replace the intrinsics that the rig names, by camera.
-    corners, method : as the options of ``ipsys live``.
+    corners, method, self_calibrate : as the options of ``ipsys live``.
     force : replace an existing log.
     say : called with remarks.
 
@@ -458,6 +459,7 @@ def live(
         model_from=None if model_from is None else parse_location(model_from),
         corners=corners,
         method=method,
+        parameters={"self_calibrate": "yes"} if self_calibrate else {},
     )
 
     target = None if record is None else Path(record)

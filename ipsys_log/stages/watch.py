@@ -9,6 +9,7 @@ from itertools import chain
 
 import numpy as np
 
+from ipsys_log.errors import IpsysError
 from ipsys_log.messages import CameraPose, CameraPoses, Event, Markers, Message, Model
 from ipsys_log.messages.channels import CAMERA_POSES, MARKERS, MODEL, RIG, RUN_EVENTS
 from ipsys_log.messages.models import MOVED, PARTLY, REPAIRED
@@ -59,9 +60,11 @@ def repair_afterwards(view: StageView, model: Model) -> list[Timed]:
 
 def _plan(view: StageView, options: Mapping[str, str]) -> Plan | str:
     model: Model = view.payloads(MODEL)[-1]
-    if not reads_corners(model.name):
-        return ""
     wanted = options.get("self_calibrate", "")
+    if not reads_corners(model.name):
+        if wanted:
+            raise IpsysError(f"--self-calibrate: {model.name} has no camera poses; use --model joint alone")
+        return ""
     parameters = {"self_calibrate": "yes" if wanted == "yes" else "afterwards"} if wanted else {}
     plan = Plan(run=view.run(MODEL), parameters=parameters, reads=(RIG, MARKERS, MODEL))
     if parameters.get("self_calibrate") == "afterwards":

@@ -14,18 +14,18 @@ Basseville and Nikiforov, Detection of abrupt changes, 1993, sect. 2.4.3: unknow
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from ipsys_log.calibration.joint.model import JointModel
-from ipsys_log.calibration.lens_models import project_points
-from ipsys_log.messages import Array
+from ipsys_log.messages import Array, Floor
 from ipsys_log.statistics.deviations import REFERENCE, Deviation
-from ipsys_log.statistics.level_sightings import SeenMarkers, observe_level
+from ipsys_log.statistics.drift import LEAST_SHIFT_M
+from ipsys_log.statistics.floor_cameras import floor_grid, shift_floor_map
 from ipsys_log.statistics.usual_deviations import UsualDeviations
-from ipsys_log.vision.markers import marker_corners
+from ipsys_log.vision.poses import PosedCamera
 
 # Steps whose deviations are tested; older ones become usual.
 TESTED_STEPS = 20
@@ -42,15 +42,14 @@ _CARRIED = 0.01
 _SURE = 10.0
 # and by which the best cause exceeds all others before it alone is named.
 _LEAD = 10.0
-# Smaller changes are left: mean shift of the floor map, height of a marker, motion of a reference marker in
-# m, and time of a clock in s.
-LEAST_SHIFT_M, _LEAST_HEIGHT_M, _LEAST_REFERENCE_M, _LEAST_CLOCK_S = 0.0012, 0.0015, 0.002, 0.0005
+# Smaller changes are left: height of a marker, motion of a reference marker in m, and time of a clock in s.
+_LEAST_HEIGHT_M, _LEAST_REFERENCE_M, _LEAST_CLOCK_S = 0.0015, 0.002, 0.0005
 # An outlier among the deviations of a repair counts less from this many standard deviations on.
 _HUBER = 4.0
 # Information on the motion of a camera before its repair.
 _REPAIR_PRIOR = np.diag(np.repeat([1 / 3e-2, 1 / 1e-2], 3) ** 2)
-# The floor that a camera sees is within this multiple of its height; distance of the nodes on it.
-_REACH, _NODES_M = 2.0, 0.3
+# Step of numeric slopes, in rad and in m.
+_SMALL = 1e-6
 _MOTION = 6
 
 
@@ -75,7 +74,7 @@ class Evidence:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Finding:
+class Explanation:
     """A cause with the start of the change that explains the deviations best.
 
     Attributes
@@ -143,8 +142,8 @@ def _sum_evidence(rows: Sequence[tuple[Array, Array, Array]]) -> Evidence:
     return Evidence(slopes.T @ weighted, weighted.T @ differences)
 
 
-def find_causes(steps: Sequence[Mapping[Cause, Evidence]]) -> Iterator[Finding]:
-    """Yield a finding for each cause.
+def find_causes(steps: Sequence[Mapping[Cause, Evidence]]) -> Iterator[Explanation]:
+    """Yield a explanation for each cause.
 
     Parameters
     ----------
@@ -159,7 +158,7 @@ def find_causes(steps: Sequence[Mapping[Cause, Evidence]]) -> Iterator[Finding]:
         if cause.kind == "carried":
             best = int(constant.argmax())
             zero = float(constant[best])
-            yield Finding(cause, starts[best], zero, zero, np.zeros(0), np.zeros((0, 0)))
+            yield Explanation(cause, starts[best], zero, zero, np.zeros(0), np.zeros((0, 0)))
         else:
             yield _best_start(cause, information, gradient, starts)
 
@@ -173,10 +172,10 @@ def _sizes(cause: Cause) -> list[Array]:
     return [np.array([size]) for size in (_CLOCK_SIZES_S if cause.kind == "clock" else _HEIGHT_SIZES_M)]
 
 
-def _best_start(cause: Cause, information: Array, gradient: Array, starts: Sequence[int]) -> Finding:
-    """Return the finding with the best start, from the sums over the steps since each start."""
+def _best_start(cause: Cause, information: Array, gradient: Array, starts: Sequence[int]) -> Explanation:
+    """Return the explanation with the best start, from the sums over the steps since each start."""
     usual: Array | None = None
-    best: Finding | None = None
+    best: Explanation | None = None
     for sizes in _sizes(cause):
         scaled = sizes[:, None] * information * sizes + np.eye(len(sizes))
         pulled = gradient * sizes
@@ -190,7 +189,7 @@ def _best_start(cause: Cause, information: Array, gradient: Array, starts: Seque
             covariance = sizes[:, None] * np.linalg.inv(scaled[row]) * sizes
             excess = float(ratios[row] - usual[row])
             estimate = sizes * solved[row]
-            best = Finding(cause, starts[row], float(ratios[row]), excess, estimate, covariance)
+            best = Explanation(cause, starts[row], float(ratios[row]), excess, estimate, covariance)
     assert best is not None
     return best
 
@@ -257,23 +256,13 @@ class ViewedFloor:
     slopes: Array
 
     @classmethod
-    def of_camera(cls, model: JointModel, width: int, height: int, length_m: float) -> ViewedFloor:
-        """Return the floor in an image of ``width`` x ``height`` px, as level markers would show it."""
-        reach_m = _REACH * float(model.origin_m[2])
-        steps_m = np.arange(-reach_m, reach_m, _NODES_M)
-        nodes_m = np.stack(np.meshgrid(steps_m, steps_m), axis=-1).reshape(-1, 1, 2) + model.origin_m[:2]
-        corners_m = np.zeros((len(nodes_m), 4, 3))
-        corners_m[..., :2] = nodes_m + marker_corners(length_m)[:, :2]
-        points_c = (corners_m - model.origin_m) @ model.camera_from_world.T
-        corners_px = project_points(model.lens_model, model.lens, points_c.reshape(-1, 3)).reshape(-1, 4, 2)
-        inside = (corners_px > 0) & (corners_px < [width, height]) & (points_c[..., 2:] > 0)
-        corners_px = corners_px[inside.all(axis=(1, 2))]
-        count = len(corners_px)
-        numbers = np.zeros(count, dtype=np.int64)
-        seen = SeenMarkers(
-            numbers, numbers, corners_px, np.tile(np.eye(8), (count, 1, 1)), np.full(count, length_m)
-        )
-        return cls(observe_level(model, seen, np.zeros(count)).by_motion[:, :2])
+    def of_camera(cls, model: JointModel, width: int, height: int, floor: Floor | None) -> ViewedFloor:
+        """Return the part of the floor in an image of ``width`` x ``height`` px."""
+        lens = replace(model.calibration, width=width, height=height)
+        camera = PosedCamera("", lens, model.camera_from_world, model.origin_m)
+        points_m = floor_grid(camera, floor)
+        shifts = [shift_floor_map(camera, points_m, motion) for motion in _SMALL * np.eye(_MOTION)]
+        return cls(np.stack(shifts, axis=-1) / _SMALL)
 
     def mean_shift(self, motion: Array) -> float:
         """Return the mean shift of positions by a motion (6,), in m."""
@@ -285,20 +274,20 @@ class ViewedFloor:
         return float(np.sqrt(variances.mean())) if len(variances) else np.inf
 
 
-def is_change(finding: Finding, floors: Mapping[str, ViewedFloor]) -> bool:
-    """Return whether a finding is certain, and large enough for a report."""
-    if finding.excess <= _SURE:
+def is_change(explanation: Explanation, floors: Mapping[str, ViewedFloor]) -> bool:
+    """Return whether a explanation is certain, and large enough for a report."""
+    if explanation.excess <= _SURE:
         return False
-    if finding.cause.kind == "camera":
-        return floors[finding.cause.name].mean_shift(finding.estimate) > LEAST_SHIFT_M
-    if finding.cause.kind == "carried":
+    if explanation.cause.kind == "camera":
+        return floors[explanation.cause.name].mean_shift(explanation.estimate) > LEAST_SHIFT_M
+    if explanation.cause.kind == "carried":
         return True
-    size = float(np.linalg.norm(finding.estimate[:3]))
+    size = float(np.linalg.norm(explanation.estimate[:3]))
     least = {"robot": _LEAST_HEIGHT_M, "reference": _LEAST_REFERENCE_M, "clock": _LEAST_CLOCK_S}
-    return size > least[finding.cause.kind]
+    return size > least[explanation.cause.kind]
 
 
-def likely_causes(findings: Sequence[Finding]) -> list[Finding]:
-    """Return the findings that are nearly as likely as the best one, the best first."""
-    ordered = sorted(findings, key=lambda one: -one.evidence)
+def likely_causes(explanations: Sequence[Explanation]) -> list[Explanation]:
+    """Return the explanations that are nearly as likely as the best one, the best first."""
+    ordered = sorted(explanations, key=lambda one: -one.evidence)
     return [one for one in ordered if one.evidence > ordered[0].evidence - _LEAD]

@@ -24,7 +24,7 @@ from ipsys_log.statistics.camera_changes import (
     TESTED_STEPS,
     Cause,
     Evidence,
-    Finding,
+    Explanation,
     Repair,
     ViewedFloor,
     find_causes,
@@ -32,7 +32,7 @@ from ipsys_log.statistics.camera_changes import (
     is_change,
     likely_causes,
 )
-from ipsys_log.statistics.deviations import STEP_NS, DeviationStream, Step
+from ipsys_log.statistics.deviations import STEP_NS, DeviationStep, DeviationStream
 from ipsys_log.statistics.usual_deviations import UsualDeviations
 from ipsys_log.units import MM_PER_M, NS_PER_S
 
@@ -53,7 +53,7 @@ _LINEAR_M = 5e-4
 _NEVER_NS = 2**62
 # Share of level markers in a camera whose pose is right; the pose of another one is unknown to this extent.
 _MANY_LEVEL, _FAR_RAD, _FAR_M = 0.7, 0.2, 0.2
-# A carried marker is left out for so long; the same finding within the second time is no new event.
+# A carried marker is left out for so long; the same explanation within the second time is no new event.
 _IGNORED_NS, _REPEATED_NS = 10 * NS_PER_S, 60 * NS_PER_S
 # Slow motions are examined at multiples of this log time. They are reported from this mean error on, with so
 # many standard deviations: an image that moves by 0.2 px in a warm camera shifts positions by 0.9 mm.
@@ -68,7 +68,7 @@ _LEAST_JUMP_MS, _SPEED_M_S = 3.0, 0.5
 class _Examined:
     """A step with the evidence in its deviations."""
 
-    step: Step
+    step: DeviationStep
     evidence: Mapping[Cause, Evidence]
 
 
@@ -140,9 +140,7 @@ class WatchCameras:
     def _see_floor(self, camera: str, frame: Markers) -> None:
         model, rig = self._stream.cameras.get(camera), self._stream.rig
         if model is not None and rig is not None and camera not in self._floors:
-            self._floors[camera] = ViewedFloor.of_camera(
-                model, frame.width, frame.height, rig.marker_length_m
-            )
+            self._floors[camera] = ViewedFloor.of_camera(model, frame.width, frame.height, rig.floor)
 
     def _take_step(self) -> Iterator[Any]:
         """Test the deviations of half a second, and improve the repairs.
@@ -223,12 +221,12 @@ class WatchCameras:
         while self._unclear is None and len(self._steps) > TESTED_STEPS:
             self._learn(self._steps.popleft().step)
             yield None
-        findings = []
-        for finding in find_causes([one.evidence for one in self._steps]):
-            findings.append(finding)
-            if len(findings) % _AT_ONCE == 0:
+        explanations = []
+        for explanation in find_causes([one.evidence for one in self._steps]):
+            explanations.append(explanation)
+            if len(explanations) % _AT_ONCE == 0:
                 yield None
-        likely = likely_causes(findings) if findings else []
+        likely = likely_causes(explanations) if explanations else []
         if not likely or (self._unclear is None and not is_change(likely[0], self._floors)):
             return
         if self._unclear is None:
@@ -242,21 +240,33 @@ class WatchCameras:
         # Two successive steps must agree.
         before, self._unclear.likely = self._unclear.likely, [one.cause for one in likely]
         is_clear = len(likely) == 1 and before == self._unclear.likely and is_change(likely[0], self._floors)
-        if is_clear or time_ns - self._unclear.noticed_ns > _LONGEST_UNCLEAR_NS:
+        if is_clear:
             since_ns, self._unclear = self._unclear.since_ns, None
             steps, self._steps = [one.step for one in self._steps], deque()
-            if is_clear:
-                yield from self._name(likely[0], since_ns, time_ns)
-                name = likely[0].cause.name
-                for step in steps:
-                    kept = [one for one in step.deviations if name not in (str(one.marker_id), *one.cameras)]
-                    self._learn(Step(step.time_ns, step.last_ns, kept))
+            yield from self._name(likely[0], since_ns, time_ns)
+            name = likely[0].cause.name
+            for step in steps:
+                kept = [one for one in step.deviations if name not in (str(one.marker_id), *one.cameras)]
+                self._learn(DeviationStep(step.time_ns, step.last_ns, kept))
+        elif time_ns - self._unclear.noticed_ns > _LONGEST_UNCLEAR_NS:
+            yield from self._give_up()
 
-    def _learn(self, step: Step) -> None:
+    def _give_up(self) -> Iterator[Any]:
+        """End the search for a cause; the cameras stay uncertain if the last steps show the change, too."""
+        assert self._unclear is not None
+        since_ns, self._unclear = self._unclear.since_ns, None
+        self._steps = deque(list(self._steps)[-TESTED_STEPS:])
+        recent = likely_causes(list(find_causes([one.evidence for one in self._steps])))
+        if not (recent and is_change(recent[0], self._floors)):
+            suspected, self._suspected = self._suspected, []
+            if suspected:
+                yield CameraPoses(self._done_ns, tuple(self._clear(suspected, since_ns)))
+
+    def _learn(self, step: DeviationStep) -> None:
         known = [one for one in step.deviations if not set(one.cameras) & set(self._moved)]
         self._usual.learn(known, step.time_ns)
 
-    def _suspect(self, likely: Sequence[Finding]) -> Iterator[Any]:
+    def _suspect(self, likely: Sequence[Explanation]) -> Iterator[Any]:
         """Report that a camera may have moved; positions of all possible ones become uncertain."""
         assert self._unclear is not None
         since_ns = self._unclear.since_ns
@@ -269,10 +279,10 @@ class WatchCameras:
             camera = poses[0].camera if len(likely) == 1 else None
             yield Event(self._done_ns, CAMERA_MOVED, text, camera, start=since_ns)
 
-    def _old_pose(self, finding: Finding, state: str, since_ns: int) -> CameraPose:
+    def _old_pose(self, explanation: Explanation, state: str, since_ns: int) -> CameraPose:
         """Return the present pose of a camera, whose covariance contains the motion that was found."""
-        covariance = finding.covariance + np.outer(finding.estimate, finding.estimate)
-        return self._pose(finding.cause.name, state, since_ns, covariance)
+        covariance = explanation.covariance + np.outer(explanation.estimate, explanation.estimate)
+        return self._pose(explanation.cause.name, state, since_ns, covariance)
 
     def _pose(
         self, camera: str, state: str, since_ns: int, covariance: Array, deviations: int = 0
@@ -282,32 +292,33 @@ class WatchCameras:
         turn, origin_m = model.camera_from_world, model.origin_m
         return CameraPose(camera, state, since_ns, origin_m, turn, covariance, deviations)
 
-    def _name(self, finding: Finding, since_ns: int, time_ns: int) -> Iterator[Any]:
+    def _clear(self, cameras: Sequence[str], since_ns: int) -> list[CameraPose]:
+        """Return the poses of cameras that have not moved, with the covariances of their last repairs."""
+        none = np.zeros((6, 6))
+        return [self._pose(one, CLEARED, since_ns, self._adopted.get(one, none)) for one in cameras]
+
+    def _name(self, explanation: Explanation, since_ns: int, time_ns: int) -> Iterator[Any]:
         """Report the cause of a change."""
-        kind, name = finding.cause
-        poses = [
-            self._pose(camera, CLEARED, since_ns, self._adopted.get(camera, np.zeros((6, 6))))
-            for camera in self._suspected
-            if kind != "camera" or camera != name
-        ]
+        kind, name = explanation.cause
+        poses = self._clear([one for one in self._suspected if (kind, name) != ("camera", one)], since_ns)
         self._suspected = []
         if kind == "camera":
-            poses.append(self._old_pose(finding, MOVED, since_ns))
-            shift_m = self._floors[name].mean_shift(finding.estimate)
+            poses.append(self._old_pose(explanation, MOVED, since_ns))
+            shift_m = self._floors[name].mean_shift(explanation.estimate)
             advice = "its new pose is being estimated" if self._self_calibrate else "use --self-calibrate"
             text = f"camera {name} has moved: its mean error is {shift_m * MM_PER_M:.1f} mm; {advice}"
             yield Event(self._done_ns, CAMERA_MOVED, text, name, start=since_ns)
-            self._stream.move(name, finding.estimate)
+            self._stream.move(name, explanation.estimate)
             self._moved[name] = _Moved(since_ns, time_ns, shift_m)
         elif kind == "clock":
-            jump_ms = float(finding.estimate[0]) * 1e3
+            jump_ms = float(explanation.estimate[0]) * 1e3
             text = f"the clock of camera {name} jumped by {jump_ms:.0f} ms; start this camera again"
             if abs(jump_ms) > _LEAST_JUMP_MS and time_ns - self._named_ns.get(name, 0) > _REPEATED_NS:
                 covariance = np.diag(np.repeat([0.001, _SPEED_M_S * jump_ms * 1e-3], 3) ** 2)
                 poses.append(self._pose(name, MOVED, since_ns, covariance))
                 yield Event(self._done_ns, CLOCK_JUMPED, text, name, start=since_ns)
             self._named_ns[name] = time_ns
-            self._stream.delay(name, -round(float(finding.estimate[0]) * NS_PER_S))
+            self._stream.delay(name, -round(float(explanation.estimate[0]) * NS_PER_S))
         elif kind == "carried":
             if time_ns - self._named_ns.get(name, 0) > _REPEATED_NS:
                 text = f"marker {name} is not level at its height: it is carried, loose, or of another height"
@@ -316,10 +327,10 @@ class WatchCameras:
             self._stream.ignore(int(name), time_ns + _IGNORED_NS)
             self._usual.forget(int(name))
         else:
-            size_mm = float(np.linalg.norm(finding.estimate[:3])) * MM_PER_M
+            size_mm = float(np.linalg.norm(explanation.estimate[:3])) * MM_PER_M
             what = "has another height on its robot" if kind == "robot" else "has moved"
             advice = "measure it again, and correct lab.toml"
-            text = f"{_describe(finding.cause)} {what}, by {size_mm:.1f} mm; {advice}"
+            text = f"{_describe(explanation.cause)} {what}, by {size_mm:.1f} mm; {advice}"
             yield Event(self._done_ns, MARKER_MOVED, text, marker_id=int(name), start=since_ns)
             self._stream.ignore(int(name), time_ns)
             self._usual.forget(int(name))

@@ -19,7 +19,7 @@ from ipsys_log.calibration.joint.locate import corner_covariances, exposure_offs
 from ipsys_log.calibration.joint.model import JointModel
 from ipsys_log.calibration.joint.payload import move_camera
 from ipsys_log.messages import Array, Indices, Marker, Markers, Message, Rig, Times
-from ipsys_log.statistics.level_sightings import FixedMarker, LevelSightings, SeenMarkers, observe_level
+from ipsys_log.statistics.level_sightings import FixedMarker, ImagedMarkers, LevelSightings, observe_level
 from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.bodies import body_shapes
 
@@ -41,7 +41,7 @@ _LONGEST_GAP_NS = NS_PER_S // 4
 _NODES = np.array([-2, -1, 0, 1])
 
 
-class Kind(NamedTuple):
+class DeviationKind(NamedTuple):
     """A kind of deviation with k values.
 
     Attributes
@@ -57,10 +57,10 @@ class Kind(NamedTuple):
 
 
 # In m and rad. In simulated labs with a wobble of 0.2 degrees, passes differ by 0.1 mm and 0.3 mm (rise).
-PAIR = Kind("pair", np.array([3e-4, 3e-4, 5e-4]), np.array([1.5e-3, 1.5e-3, 2e-3]))
-RISE = Kind("rise", np.array([5e-4]), np.array([2e-3]))
+PAIR = DeviationKind("pair", np.array([3e-4, 3e-4, 5e-4]), np.array([1.5e-3, 1.5e-3, 2e-3]))
+RISE = DeviationKind("rise", np.array([5e-4]), np.array([2e-3]))
 # In px: slow changes by light. Before its first sighting, a reference marker can be anywhere.
-REFERENCE = Kind("reference", np.full(8, 0.03), np.full(8, 1e4))
+REFERENCE = DeviationKind("reference", np.full(8, 0.03), np.full(8, 1e4))
 
 PlaceKey = tuple[str, tuple[str, ...], int, int]
 
@@ -80,7 +80,7 @@ class Deviation:
     by_clock : (k, 1), by a later stamp of the second camera; None for one camera.
     """
 
-    kind: Kind
+    kind: DeviationKind
     marker_id: int
     cameras: tuple[str, ...]
     place: tuple[int, int]
@@ -128,17 +128,12 @@ def _rises(camera: str, seen: LevelSightings, first_ns: int, last_ns: int) -> It
         )
 
 
-def places_of(poses: Array) -> list[tuple[int, int]]:
-    """Return the places of poses (n, 3)."""
-    return [(i, j) for i, j in np.floor(poses[:, :2] / _PLACE_M).astype(np.int64).tolist()]
-
-
 def _by_place(ids: Times, poses: Array) -> Iterator[tuple[int, tuple[int, int], Indices]]:
     """Yield markers and places, with the rows (m,) of each."""
-    squares = places_of(poses)
+    squares = np.floor(poses[:, :2] / _PLACE_M).astype(np.int64)
     groups: dict[tuple[int, int, int], list[int]] = defaultdict(list)
-    for row, (marker_id, square) in enumerate(zip(ids.tolist(), squares, strict=True)):
-        groups[int(marker_id), *square].append(row)
+    for row, key in enumerate(zip(ids.tolist(), *squares.T.tolist(), strict=True)):
+        groups[key].append(row)
     for (marker_id, i, j), own in groups.items():
         yield marker_id, (i, j), np.array(own)
 
@@ -208,7 +203,7 @@ def _lagrange(ahead_s: Array) -> Array:
 
 
 @dataclass(slots=True, eq=False)
-class Step:
+class DeviationStep:
     """The deviations in half a second: its log time, and the last instant of its sightings."""
 
     time_ns: int
@@ -288,13 +283,13 @@ class DeviationStream:
         before, self._number = self._number, max(number, self._number or 0)
         return before is not None and number > before
 
-    def finish_step(self) -> Iterator[Step | None]:
+    def finish_step(self) -> Iterator[DeviationStep | None]:
         """Yield the step of the markers so far; None before it are pauses, in which others can work."""
         assert self.rig is not None
         assert self._number is not None
         waiting, self._waiting = self._waiting, {}
         first_ns, self._done_ns = self._done_ns, max(self._newest_ns - _DELAY_NS, self._done_ns)
-        step = Step(self._number * STEP_NS, self._done_ns, [])
+        step = DeviationStep(self._number * STEP_NS, self._done_ns, [])
         for camera, rows in waiting.items():
             step.deviations += self._observe(self.rig, camera, rows)
             yield None
@@ -345,9 +340,9 @@ def _size_of(rig: Rig | None, marker_id: int) -> tuple[float | None, float] | No
     return None if rig is None else (rig.height_of(marker_id), rig.length_of(marker_id))
 
 
-def _seen(rig: Rig, rows: Sequence[tuple[int, Marker]]) -> SeenMarkers:
+def _seen(rig: Rig, rows: Sequence[tuple[int, Marker]]) -> ImagedMarkers:
     markers = [marker for _, marker in rows]
-    return SeenMarkers(
+    return ImagedMarkers(
         np.array([time_ns for time_ns, _ in rows], dtype=np.int64),
         np.array([marker.id for marker in markers], dtype=np.int64),
         np.array([marker.corners_px for marker in markers], dtype=np.float64),

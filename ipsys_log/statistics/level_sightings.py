@@ -27,7 +27,7 @@ _MOTION = 6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SeenMarkers:
+class ImagedMarkers:
     """Markers in the images of one camera.
 
     Attributes
@@ -79,7 +79,7 @@ class LevelSightings:
         return both.select(np.lexsort((both.times_ns, both.ids)))
 
 
-def observe_level(model: JointModel, seen: SeenMarkers, heights_m: Array) -> LevelSightings:
+def observe_level(model: JointModel, seen: ImagedMarkers, heights_m: Array) -> LevelSightings:
     """Return the level sightings of markers on robots; markers that are not level are left out.
 
     Parameters
@@ -128,7 +128,7 @@ class FixedMarker:
     size_m: float
 
     @classmethod
-    def find(cls, model: JointModel, seen: SeenMarkers) -> FixedMarker | None:
+    def find(cls, model: JointModel, seen: ImagedMarkers) -> FixedMarker | None:
         """Return the marker from n >= 1 sightings; None if the camera cannot see it by its model."""
         middle = np.median(seen.corners_px, axis=0, keepdims=True)
         poses = locate_poses(model, middle, seen.covariances_px2[:1], seen.lengths_m[:1])

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ipsys_log.messages import Array
-from ipsys_log.statistics.deviations import PAIR, REFERENCE, RISE, Deviation, Kind, PlaceKey
+from ipsys_log.statistics.deviations import PAIR, REFERENCE, RISE, Deviation, DeviationKind, PlaceKey
 from ipsys_log.units import NS_PER_S
 
 # Slow changes of a place by temperature, as a share of the standard deviation of its passes, per root of s;
@@ -101,7 +101,7 @@ class UsualDeviations:
         aged = min(_DRIFT**2 * age_s, _MOST_DRIFT**2) * one.kind.passes**2
         return one.value - mean.value, self._variance(one) + mean.variance + aged
 
-    def _mean(self, kind: Kind, place: _Place, one: Deviation | None) -> _Mean | None:
+    def _mean(self, kind: DeviationKind, place: _Place, one: Deviation | None) -> _Mean | None:
         """Return the mean of a place, with the height of the marker of a deviation there; None if unknown."""
         none = dict[int, int](), np.zeros(0), np.zeros((0, 0))
         numbers, heights_m, covariance = self._heights.get(kind.name, none)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -42,6 +42,27 @@ class Disturbance:
     shift_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     zoom: float = 0.0
     clock_s: float = 0.0
+
+
+def lying(x_m: float, y_m: float, moves_at_s: float = np.inf) -> Place:
+    """Return the poses of a marker on the floor that is moved by 4.5 mm at a time."""
+    turn = rotation(np.array([0.0, 0.0, x_m]))
+
+    def place(times_s: Array) -> PlacedMarkers:
+        centres_m = np.tile([x_m, y_m, 0.0], (len(times_s), 1))
+        centres_m[times_s > moves_at_s] += [0.004, 0.002, 0.0]
+        return PlacedMarkers(centres_m, np.tile(turn, (len(times_s), 1, 1)))
+
+    return place
+
+
+def keep_markers(messages: Iterable[Message], ids: Collection[int]) -> Iterator[Message]:
+    """Yield messages whose frames have only some markers."""
+    for message in messages:
+        frame = message.payload
+        if isinstance(frame, Markers):
+            frame = replace(frame, markers=tuple(one for one in frame.markers if one.id in ids))
+        yield replace(message, payload=frame)
 
 
 def disturb(camera: Camera, change: Disturbance) -> Camera:

@@ -37,7 +37,7 @@ from ipsys_log.statistics.camera_watch import WatchCameras
 from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.poses import rotation, rotation_vector
 from tests.conftest import Ipsys
-from tests.geometric.knocks import Disturbance, Place, drive_messages
+from tests.geometric.knocks import Disturbance, drive_messages, keep_markers, lying
 from tests.geometric.lab import GeometricLab, GeometricSettings, PlacedMarkers, build_lab
 from tests.geometric.session import MARKERS_RUN, geometric_rig, simulate_session
 
@@ -100,15 +100,6 @@ def watch(model: Model, messages: Iterable[Message], self_calibrate: bool = True
             else:
                 poses += [(after_s, pose) for pose in payload.poses]
     return Watched(events, poses)
-
-
-def lying(x_m: float, y_m: float, moves_at_s: float = np.inf) -> Place:
-    def place(times_s: Array) -> PlacedMarkers:
-        centres_m = np.tile([x_m, y_m, 0.0], (len(times_s), 1))
-        centres_m[times_s > moves_at_s] += [0.004, 0.002, 0.0]
-        return PlacedMarkers(centres_m, np.tile(rotation(np.array([0, 0, x_m])), (len(times_s), 1, 1)))
-
-    return place
 
 
 def in_hand(times_s: Array) -> PlacedMarkers:
@@ -183,18 +174,10 @@ def test_other_camera_at_a_place_is_named(model: Model) -> None:
     assert "camera black was turned far, zoomed, or exchanged" in event.text
 
 
-def only_references(messages: Iterator[Message]) -> Iterator[Message]:
-    for message in messages:
-        frame = message.payload
-        if isinstance(frame, Markers):
-            frame = replace(frame, markers=tuple(one for one in frame.markers if one.id in REFERENCES))
-        yield replace(message, payload=frame)
-
-
 def test_reference_markers_alone_repair_a_camera(model: Model) -> None:
     fixed = {marker_id: lying(*place) for marker_id, place in REFERENCES.items()}
     messages = drive_messages(build(END_S), [KNOCK], 0.0, fixed, list(REFERENCES))
-    said = watch(model, only_references(messages))
+    said = watch(model, keep_markers(messages, REFERENCES))
     repaired = [pose for _, pose in said.poses if pose.state == REPAIRED]
     expected = restore_joint(model)["white"].origin_m + KNOCK.shift_m
     assert np.linalg.norm(repaired[-1].position_m - expected) < 0.0005
@@ -261,6 +244,15 @@ def test_afterwards_positions_are_right_from_the_knock_on(log: Path, ipsys: Ipsy
     since_ns = EPOCH_NS + (KNOCK_S + 1) * NS_PER_S + 2 * NS_PER_S
     assert all(p.inside for frame in frames if frame.timestamp > since_ns for p in frame.positions)
     assert ipsys("verify", log, result).out.endswith("the replay is identical to the log\n")
+
+
+def test_self_calibration_of_another_model_is_one_line(ipsys: Ipsys, lab_log: Path, tmp_path: Path) -> None:
+    own = tmp_path / "lab.mcap"
+    own.write_bytes(lab_log.read_bytes())
+    done = ipsys("replay", own, "--model", "poly", "--self-calibrate")
+    assert done.code == 1
+    assert "--self-calibrate: poly has no camera poses" in done.err
+    assert "Traceback" not in done.err
 
 
 def test_drift_names_the_knock_and_appends_the_new_pose(log: Path, ipsys: Ipsys, tmp_path: Path) -> None:

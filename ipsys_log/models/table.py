@@ -80,7 +80,7 @@ MODEL_PARTS = {
     "kriging-regression": ModelPart(lambda: _kriging(noisy=True), version=2, min_pairs=6),
     "rayplane": ModelPart(_ray_plane, version=3, min_pairs=5, reads_height=True),
     "best": ModelPart(_ray_depth, version=2, min_pairs=5),
-    "joint": ModelPart(None, version=6, min_pairs=0, reads_height=True),
+    "joint": ModelPart(None, version=7, min_pairs=0, reads_height=True),
 }
 
 # First the models of the paper in the order of its tables: RT, PR, RT+PR, ANN, RT+ANN, KI, RT+KI, KR, RT+KR.

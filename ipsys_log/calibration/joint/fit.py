@@ -341,12 +341,12 @@ def _make_factors(
     # Only an average over many frames has less noise than the errors of print and lens.
     floor_px = settings.corner_floor_px if kind is Kind.STATIONARY else 0.0
     for camera, (sightings, trajectory) in enumerate(zip(observations.sightings, trajectories, strict=True)):
-        rows = trajectory >= 0
-        if not rows.any():
-            continue
-        own = sightings.select(rows), trajectory[rows], kind
-        made = make_sighting_factors(camera, *own, observations.bodies, floor_px)
-        factors.append(at_one_instant(made) if observations.cameras[camera].known_row_s else made)
+        recordings = observations.recording_of(sightings)
+        for recording in np.unique(recordings[trajectory >= 0]).tolist():
+            rows = (trajectory >= 0) & (recordings == recording)
+            own = sightings.select(rows), trajectory[rows], kind
+            made = make_sighting_factors(camera, *own, observations.bodies, floor_px, recording)
+            factors.append(at_one_instant(made) if observations.cameras[camera].known_row_s else made)
     return factors
 
 

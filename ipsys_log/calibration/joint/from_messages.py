@@ -47,6 +47,10 @@ _REPEATABLE_SHARE = 0.35
 _HANDLING_NS = 2 * NS_PER_S
 # More sightings of a path per second cost time and give little, because its knots are 0.1 s apart.
 _LEAST_STEP_NS = NS_PER_S // 12
+# After so long without any sighting, the clocks may have other offsets: another recording may begin.
+_RESTART_S = 10.0
+# Longer drives are used in parts of this length, which are evenly spread in time.
+_MOST_DRIVE_S, _DRIVE_PART_S = 600.0, 10.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,7 +86,8 @@ def gather_observations(
 
     Sightings within the stationary interval of a measurement are averaged for each camera. Sightings of a
     marker before its first and after its last stationary interval are those of a robot, if the rig has the
-    height of the marker. In between, somebody carries the marker to its next point.
+    height of the marker. In between, somebody carries the marker to its next point. The messages may be those
+    of several recordings.
 
     Parameters
     ----------
@@ -113,17 +118,17 @@ def gather_observations(
     bodies = tuple(_body(rig, marker_id) for marker_id in ids)
     points = tuple(_point(one, rig, ids.index(one.marker_id)) for one in valid if one.marker_id is not None)
     epoch_ns = min((int(track.times_ns[0]) for own in tracks.values() for track in own.values()), default=0)
-    sightings = []
-    for own in tracks.values():
-        rows = _stationary(own, valid, ids, epoch_ns)
-        if with_drives:
-            rows += _moving(own, valid, ids, rig, epoch_ns)
-        sightings.append(_table(rows))
+    stationary = [_stationary(own, valid, ids, epoch_ns) for own in tracks.values()]
+    moving = [_moving(own, valid, ids, rig, epoch_ns) if with_drives else [] for own in tracks.values()]
+    parts = _choose_parts(moving)
+    chosen = [[row for row in rows if _part(row) in parts] for rows in moving]
+    sightings = [_table(rest + rows) for rest, rows in zip(stationary, chosen, strict=True)]
     cameras = tuple(
         CameraPrior(camera, calibrations[camera], camera in nominal, *_row_times(rig, camera))
         for camera in tracks
     )
-    return Observations(cameras, bodies, points, tuple(sightings), _tape(rig, baselines))
+    restarts_s = _restarts_s(tracks, chosen, epoch_ns)
+    return Observations(cameras, bodies, points, tuple(sightings), _tape(rig, baselines), restarts_s)
 
 
 def _tape(rig: Rig, baselines: Sequence[Measurement]) -> Tape:
@@ -275,6 +280,31 @@ def _moving(
             time_s = float(track.times_ns[row] - epoch_ns) / NS_PER_S
             rows.append(_Row(ids.index(marker_id), -1, time_s, track.pixels[row], track.covariances_px2[row]))
     return rows
+
+
+def _part(row: _Row) -> int:
+    return int(row.time_s // _DRIVE_PART_S)
+
+
+def _choose_parts(moving: Sequence[Sequence[_Row]]) -> set[int]:
+    """Return the numbers of the parts of drives that are used."""
+    parts = sorted({_part(row) for rows in moving for row in rows})
+    most = round(_MOST_DRIVE_S / _DRIVE_PART_S)
+    if len(parts) <= most:
+        return set(parts)
+    return {parts[number] for number in np.linspace(0, len(parts) - 1, most).astype(np.intp).tolist()}
+
+
+def _restarts_s(
+    tracks: Mapping[str, Mapping[int, _Track]], moving: Sequence[Sequence[_Row]], epoch_ns: int
+) -> Array:
+    """Return the starts (r,) of all recordings of moving bodies but the first."""
+    all_ns = [np.unique(track.times_ns) for own in tracks.values() for track in own.values()]
+    times_s = (np.sort(np.concatenate([np.zeros(0, dtype=np.int64), *all_ns])) - epoch_ns) / NS_PER_S
+    starts_s = times_s[1:][np.diff(times_s) > _RESTART_S]
+    driven_s = np.array([row.time_s for rows in moving for row in rows])
+    used = np.unique(np.searchsorted(starts_s, driven_s, side="right"))
+    return np.asarray(starts_s[used[1:] - 1])
 
 
 def _interval_ns(track: _Track, measurement: Measurement) -> tuple[int, int]:

@@ -32,6 +32,8 @@ _FEW, _CONTRADICTED_BY_FEW = 40, 200.0
 _POSE = 6
 # A larger turn is that of a few outliers, which any pose explains.
 _MOST_TURN_RAD = 0.17
+# A smaller motion, as a shift of the floor map, is one by temperature: 0.2 px of an image are about 0.9 mm.
+_LEAST_MOTION_M = 0.0003
 # A factor on the limits of the loss with which no residual is an outlier.
 _NO_LIMIT = 1e12
 # In simulated labs, true motions achieve at least 1.9 times the promised decrease; outliers at one instant
@@ -117,6 +119,8 @@ def find_motion(squares: Squares, camera: int) -> CameraMotion | None:
     is_later = times_s > best.time_s
     has_few = any(len(side) < _FEW and side.max() == 1 for side in (worths[is_later], worths[~is_later]))
     is_shown = best.chi2 > (_CONTRADICTED_BY_FEW if has_few else _CONTRADICTED)
+    height_m = abs(float(squares.fit.state.values[squares.fit.problem.layout.cameras[camera].start + 5]))
+    is_shown &= best.turn_rad * height_m + best.shift_m > _LEAST_MOTION_M
     return best if is_shown and best.turn_rad < _MOST_TURN_RAD else None
 
 

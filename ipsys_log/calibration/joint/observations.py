@@ -154,18 +154,28 @@ class Sightings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observations:
-    """Everything that was observed in a lab; ``sightings`` has one entry for each camera."""
+    """Everything that was observed in a lab; ``sightings`` has one entry for each camera.
+
+    At each time of ``restarts_s`` (r,), another recording of moving bodies begins. Its clocks have other
+    offsets.
+    """
 
     cameras: tuple[CameraPrior, ...]
     bodies: tuple[Body, ...]
     points: tuple[CalibrationPoint, ...]
     sightings: tuple[Sightings, ...]
     tape: Tape = Tape()
+    restarts_s: Array = field(default_factory=lambda: np.zeros(0))
 
     @property
     def in_hall(self) -> bool:
         """True with so many cameras that most of them never see the same place."""
         return len(self.cameras) > _FEW_CAMERAS
+
+    def recording_of(self, sightings: Sightings) -> Indices:
+        """Return the number (n,) of the recording of each sighting; bodies at rest are in the last one."""
+        numbers = np.searchsorted(self.restarts_s, sightings.times_s, side="right")
+        return np.where(sightings.point < 0, numbers, len(self.restarts_s))
 
 
 def without_points(observations: Observations, names: Collection[str]) -> Observations:

@@ -22,7 +22,7 @@ class CameraBlock:
     """Columns of a camera among the global unknowns.
 
     They are: rotation (3, a small turn in camera coordinates), position in the world (3), intrinsics (q),
-    edge offset in px, clock offset in s, row time in s.
+    edge offset in px, clock offset in s, row time in s. The clock offset is that of the last recording.
     """
 
     start: int
@@ -46,7 +46,7 @@ class CameraBlock:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Layout:
-    """Order of the global unknowns: cameras, scales and heights of bodies, modes of the floor, tape.
+    """Order of the global unknowns: cameras, bodies' scales and heights, floor, tape, former clocks.
 
     ``mean`` (g,) and ``sigma`` (g,) are the prior. A sigma of 0 keeps an unknown constant; infinity is no
     prior.
@@ -77,6 +77,11 @@ class Layout:
     def tape(self) -> slice:
         """The columns of the scale of the tape, and of the scale of the reference points in the rig."""
         return slice(self.modes.stop, self.modes.stop + 2)
+
+    def clock(self, camera: int, recording: int) -> int:
+        """Return the column of the clock offset of a camera in a recording."""
+        former = self.tape.stop + recording * len(self.cameras)
+        return self.cameras[camera].edge + 1 if former == len(self.mean) else former + camera
 
     @property
     def free(self) -> NDArray[np.bool_]:
@@ -127,11 +132,10 @@ def make_layout(
 ) -> Layout:
     """Return the order and the prior of the global unknowns; clocks are free if bodies are ``moving``."""
     blocks, means, sigmas, start = [], [], [], 0
-    clocks = _free_clocks(observations) if moving else [False] * len(observations.cameras)
-    for camera, free in zip(observations.cameras, clocks, strict=True):
+    clocks_s: Array = np.where(_free_clocks(observations) & moving, settings.clock_sigma_s, _FIXED)
+    for camera, clock_s in zip(observations.cameras, clocks_s[-1].tolist(), strict=True):
         block = CameraBlock(start, lens_model_of(camera.lens))
-        clock = settings.clock_sigma_s if free else _FIXED
-        mean, sigma = _camera_prior(camera, settings, clock, moving)
+        mean, sigma = _camera_prior(camera, settings, clock_s, moving)
         blocks.append(block)
         means.append(mean)
         sigmas.append(sigma)
@@ -139,12 +143,14 @@ def make_layout(
     bodies = observations.bodies
     heights_m = np.array([body.height_m or 0.0 for body in bodies])
     height_sigmas_m = [body.height_sigma_m if body.height_m is not None else _FIXED for body in bodies]
-    means += [np.ones(len(bodies)), heights_m, np.zeros(floor.count), np.ones(2)]
+    former_s: Array = clocks_s[:-1].reshape(-1)
+    means += [np.ones(len(bodies)), heights_m, np.zeros(floor.count), np.ones(2), np.zeros(len(former_s))]
     sigmas += [
         np.array([body.scale_sigma for body in bodies]),
         np.array(height_sigmas_m) if moving else np.zeros(len(bodies)),
         np.ones(floor.count),
         tape_sigmas(observations),
+        former_s,
     ]
     return Layout(tuple(blocks), len(bodies), floor, np.concatenate(means), np.concatenate(sigmas))
 
@@ -157,15 +163,19 @@ def tape_sigmas(observations: Observations) -> Array:
     return np.array([tape.scale_sigma if reads else _FIXED, tape.references_sigma if refers else _FIXED])
 
 
-def _free_clocks(observations: Observations) -> list[bool]:
-    """Return which cameras have a clock offset to estimate: those that see moving bodies, but one.
+def _free_clocks(observations: Observations) -> NDArray[np.bool_]:
+    """Return which cameras have a clock offset to estimate in each recording, (r, c).
 
-    The clock of this one is the reference. A camera that hardly sees a moving body is no good reference,
-    because it does not determine the times of the paths.
+    These are the cameras that see moving bodies, but one. The clock of this one is the reference. A camera
+    that hardly sees a moving body is no good reference, because it does not determine the times of the paths.
     """
-    counts = [int((sightings.point < 0).sum()) for sightings in observations.sightings]
-    reference = next(number for number, count in enumerate(counts) if 2 * count >= max(counts))
-    return [count > 0 and number != reference for number, count in enumerate(counts)]
+    counts = np.zeros((len(observations.restarts_s) + 1, len(observations.cameras)), dtype=np.intp)
+    for camera, sightings in enumerate(observations.sightings):
+        moving = sightings.select(sightings.point < 0)
+        counts[:, camera] = np.bincount(observations.recording_of(moving), minlength=len(counts))
+    free = counts > 0
+    free[np.arange(len(free)), (2 * counts >= counts.max(axis=1)[:, None]).argmax(axis=1)] = False
+    return free
 
 
 def _camera_prior(

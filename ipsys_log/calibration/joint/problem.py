@@ -126,6 +126,7 @@ def find_blocks(
         moving = factors.kind is Kind.FLOOR
         numbers = factors.trajectory + 1 if moving else np.zeros_like(factors.trajectory)
         used[np.unique(numbers), block.start : block.stop] = True
+        used[np.unique(numbers), layout.clock(factors.camera, factors.recording)] = True
         used[numbers, layout.scales.start + bodies] = True
         used[numbers, layout.heights.start + bodies] |= moving
     ends = [*starts[1:].tolist(), trajectories.local_count]

@@ -69,6 +69,7 @@ class SightingFactors:
     inward : (n, p, 2), motion of a point in the image by an edge offset of 1 px.
     variances : (n, 2 p, 2 p), covariances with the repeatable part of the errors.
     whitening : (n, 2 p, 2 p), matrices that turn residuals into numbers of variance 1.
+    recording : index of the recording, whose clock gives the times of moving bodies.
     """
 
     camera: int
@@ -81,6 +82,7 @@ class SightingFactors:
     inward: Array
     variances: Array
     whitening: Array
+    recording: int = 0
 
     @property
     def limit(self) -> Array:
@@ -92,8 +94,8 @@ class SightingFactors:
         """Return the poses of the bodies at the instants of the sightings."""
         if self.kind is Kind.STATIONARY:
             return trajectories.place_stationary(self.trajectory, state)
-        edge = layout.cameras[self.camera].edge
-        clock_s, row_s = state.values[edge + 1 : edge + 3]
+        clock_s = state.values[layout.clock(self.camera, self.recording)]
+        row_s = state.values[layout.cameras[self.camera].edge + 2]
         times_s = self.sightings.times_s + clock_s + row_s * self.rows.mean(axis=1)
         if self.kind is Kind.FREE:
             return trajectories.place_free(self.trajectory, times_s, state)
@@ -155,7 +157,9 @@ class SightingFactors:
     def columns(self, layout: Layout) -> Indices:
         """Return the global unknowns (u,) of these factors, less the modes of the floor."""
         block, bodies = layout.cameras[self.camera], np.unique(self.sightings.body)
-        parts = [np.arange(block.start, block.stop), layout.scales.start + bodies]
+        camera = np.arange(block.start, block.stop)
+        camera[block.edge + 1 - block.start] = layout.clock(self.camera, self.recording)
+        parts = [camera, layout.scales.start + bodies]
         return np.concatenate([*parts, layout.heights.start + bodies] if self.kind is Kind.FLOOR else parts)
 
     def slopes(self, place: Placement, state: State, layout: Layout) -> Slopes:
@@ -265,6 +269,7 @@ def make_sighting_factors(
     kind: Kind,
     bodies: tuple[Body, ...],
     floor_px: float,
+    recording: int = 0,
 ) -> SightingFactors:
     """Return the factors of sightings; ``floor_px`` is the repeatable part of the error of a point."""
     visible: NDArray[np.bool_] = np.isfinite(sightings.pixels[:, :, 0])
@@ -285,6 +290,7 @@ def make_sighting_factors(
         _inward(pixels),
         variances,
         whitening,
+        recording,
     )
 
 

@@ -46,8 +46,10 @@ _LEAD = 10.0
 _LEAST_HEIGHT_M, _LEAST_REFERENCE_M, _LEAST_CLOCK_S = 0.0015, 0.002, 0.0005
 # An outlier among the deviations of a repair counts less from this many standard deviations on.
 _HUBER = 4.0
-# Information on the motion of a camera before its repair.
-_REPAIR_PRIOR = np.diag(np.repeat([1 / 3e-2, 1 / 1e-2], 3) ** 2)
+# Standard deviation of a turn about an axis before the repair: this share of the turn by the first estimate,
+# beside the least one. If two of three axes show, 95 % of random turns are within it. The mount turns about a
+# point at this distance, or is shifted by some mm.
+_UNSEEN_TURN, _LEAST_TURN_RAD, _LEVER_M, _UNSEEN_SHIFT_M = 1.6, 1e-3, 0.15, 2e-3
 # Step of numeric slopes, in rad and in m.
 _SMALL = 1e-6
 _MOTION = 6
@@ -200,11 +202,13 @@ class Repair:
 
     Attributes
     ----------
+    turn_rad : the turn by the first estimate; other axes may have turned as far, unseen.
     motion : (6,), from the pose that the deviations refer to.
     information, gradient, squares : the log likelihood of a motion, as a parabola.
     count, values : number of deviations, and of their values.
     """
 
+    turn_rad: float
     motion: Array = field(default_factory=lambda: np.zeros(_MOTION))
     information: Array = field(default_factory=lambda: np.zeros((_MOTION, _MOTION)))
     gradient: Array = field(default_factory=lambda: np.zeros(_MOTION))
@@ -240,7 +244,9 @@ class Repair:
     @property
     def covariance(self) -> Array:
         """The covariance (6, 6) of the motion."""
-        return np.asarray(np.linalg.inv(self.information + _REPAIR_PRIOR))
+        turn_rad = _UNSEEN_TURN * self.turn_rad + _LEAST_TURN_RAD
+        sizes = np.repeat([turn_rad, _LEVER_M * turn_rad + _UNSEEN_SHIFT_M], 3)
+        return np.asarray(np.linalg.inv(self.information + np.diag(sizes**-2)))
 
     @property
     def misfit(self) -> float:

@@ -43,13 +43,12 @@ _LONGEST_UNCLEAR_NS = 60 * NS_PER_S
 # of the error of the old positions; from the last age on, any.
 _ADOPTIONS_NS = tuple(age_s * NS_PER_S for age_s in (3, 6, 10, 20, 60))
 _CERTAIN_M, _BETTER = 4e-4, 0.2
-# A repair with a larger mean square of its residuals is refused: no motion of the camera explains them.
-_MOST_MISFIT = 4.0
+# A repair with a larger mean square of its residuals begins again at the first two ages, for the slopes of a
+# large motion are wrong; later it is refused. Motions have 0.7 at most, other focal lengths reach 1 to 60.
+_MOST_MISFIT = 1.5
 _FEWEST_DEVIATIONS = 20
 # Variances of a motion that no number of deviations reduces: warmth and light, in rad^2 and m^2.
 _LEAST_COVARIANCE = np.diag(np.repeat([1e-5, 3e-5], 3) ** 2)
-# With a larger error of the first estimate, the slopes are wrong: the repair begins again.
-_LINEAR_M = 5e-4
 _NEVER_NS = 2**62
 # Share of level markers in a camera whose pose is right; the pose of another one is unknown to this extent.
 _MANY_LEVEL, _FAR_RAD, _FAR_M = 0.7, 0.2, 0.2
@@ -83,7 +82,7 @@ class _Moved:
     since_ns: int
     named_ns: int
     shift_m: float
-    repair: Repair = field(default_factory=Repair)
+    repair: Repair
     next_ns: int = _ADOPTIONS_NS[0]
     state: str = MOVED
 
@@ -194,7 +193,9 @@ class WatchCameras:
                 self._usual.forget_camera(camera)
                 if self._self_calibrate:
                     self._stream.move(camera, motion)
-                    self._adopted[camera] = covariance + self._adopted.get(camera, 0.0)
+                    # All cameras share the motion of one, and means lag behind it: as much again may be left.
+                    unknown = covariance + np.outer(motion, motion)
+                    self._adopted[camera] = unknown + self._adopted.get(camera, 0.0)
                     pose = self._pose(camera, REPAIRED, self._done_ns, self._adopted[camera])
                     yield CameraPoses(self._done_ns, (pose,))
 
@@ -214,7 +215,7 @@ class WatchCameras:
                 "calibrate the lab again"
             )
             yield Event(self._done_ns, CAMERA_MOVED, text, camera, start=self._done_ns)
-            self._moved[camera] = _Moved(self._done_ns, time_ns, _FAR_M, next_ns=_NEVER_NS)
+            self._moved[camera] = _Moved(self._done_ns, time_ns, _FAR_M, Repair(_FAR_RAD), _NEVER_NS)
 
     def _examine(self, time_ns: int) -> Iterator[Any]:
         """Test the last steps for a change; report it, and its cause when that is clear."""
@@ -303,13 +304,18 @@ class WatchCameras:
         poses = self._clear([one for one in self._suspected if (kind, name) != ("camera", one)], since_ns)
         self._suspected = []
         if kind == "camera":
+            # Its deviations are in the repairs of others: certain ones end, the rest begins again.
+            self._moved = {one: moved for one, moved in self._moved.items() if moved.state != REPAIRED}
+            for moved in self._moved.values():
+                moved.repair = Repair(moved.repair.turn_rad)
             poses.append(self._old_pose(explanation, MOVED, since_ns))
             shift_m = self._floors[name].mean_shift(explanation.estimate)
             advice = "its new pose is being estimated" if self._self_calibrate else "use --self-calibrate"
             text = f"camera {name} has moved: its mean error is {shift_m * MM_PER_M:.1f} mm; {advice}"
             yield Event(self._done_ns, CAMERA_MOVED, text, name, start=since_ns)
             self._stream.move(name, explanation.estimate)
-            self._moved[name] = _Moved(since_ns, time_ns, shift_m)
+            repair = Repair(float(np.linalg.norm(explanation.estimate[:3])))
+            self._moved[name] = _Moved(since_ns, time_ns, shift_m, repair)
         elif kind == "clock":
             jump_ms = float(explanation.estimate[0]) * 1e3
             text = f"the clock of camera {name} jumped by {jump_ms:.0f} ms; start this camera again"
@@ -346,10 +352,9 @@ class WatchCameras:
         moved.next_ns = next((one for one in _ADOPTIONS_NS if one > age_ns), age_ns + _ADOPTIONS_NS[-1])
         is_last = age_ns >= _ADOPTIONS_NS[-1]
         if repair.misfit > _MOST_MISFIT:
-            if not is_last and self._floors[camera].mean_shift(repair.motion) > _LINEAR_M:
-                self._stream.move(camera, repair.motion)
-                moved.repair = Repair()
-            elif is_last or moved.state != MOVED:
+            self._stream.move(camera, repair.motion)
+            moved.repair = Repair(repair.turn_rad)
+            if age_ns >= _ADOPTIONS_NS[2] or moved.state != MOVED:
                 yield from self._refuse(camera, moved)
             return
         covariance = repair.covariance * max(repair.misfit, 1.0) + _LEAST_COVARIANCE
@@ -375,9 +380,8 @@ class WatchCameras:
 
     def _refuse(self, camera: str, moved: _Moved) -> Iterator[Any]:
         """End a repair without a new pose."""
-        if moved.state != MOVED:
-            covariance = np.diag(np.repeat([moved.shift_m / 2, moved.shift_m], 3) ** 2)
-            yield CameraPoses(self._done_ns, (self._pose(camera, MOVED, moved.since_ns, covariance),))
+        covariance = np.diag(np.repeat([moved.shift_m / 4, moved.shift_m / 2], 3) ** 2)
+        yield CameraPoses(self._done_ns, (self._pose(camera, MOVED, moved.since_ns, covariance),))
         moved.state, moved.next_ns = MOVED, _NEVER_NS
         text = (
             f"camera {camera}: no motion explains its deviations: its lens was changed, or it is another "

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,8 +33,8 @@ class Disturbance:
     """A change of a camera from a time of the drive on.
 
     ``turn_rad`` is a rotation vector about the axes of the camera, ``shift_m`` a motion in the world. With
-    ``over_s``, the motion is gradual. ``zoom`` is a relative change of the focal length, ``clock_s`` a step
-    of the stamps.
+    ``over_s``, the motion is gradual. ``zoom`` is a relative change of the focal length, ``centre_px`` a
+    shift of the principal point, ``clock_s`` a step of the stamps.
     """
 
     camera: str
@@ -41,7 +42,9 @@ class Disturbance:
     turn_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
     shift_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     zoom: float = 0.0
+    centre_px: tuple[float, float] = (0.0, 0.0)
     clock_s: float = 0.0
+    over_s: float = 0.0
 
 
 def lying(x_m: float, y_m: float, moves_at_s: float = np.inf) -> Place:
@@ -72,6 +75,7 @@ def disturb(camera: Camera, change: Disturbance) -> Camera:
     K = camera.lens.K.copy()
     K[0, 0] *= 1 + change.zoom
     K[1, 1] *= 1 + change.zoom
+    K[:2, 2] += change.centre_px
     return replace(
         camera,
         camera_from_world=make_pose(turned, -turned @ origin_m),
@@ -127,8 +131,12 @@ def _frames(
     stamps_ns = drive_times_ns(lab) + lab.frame_delays_ns[camera.name] + lab.clock_offsets_ns[camera.name]
     for first_ns, last_ns, change in zip(bounds[:-1], bounds[1:], [None, *own], strict=True):
         if change is not None:
-            camera, clock_ns = disturb(camera, change), clock_ns + round(change.clock_s * NS_PER_S)
+            before, camera = camera, disturb(camera, change)
+            clock_ns += round(change.clock_s * NS_PER_S)
         seen = simulate_sightings(lab, camera)
+        if change is not None and change.over_s:
+            share = (seen.stamps_ns - first_ns) / NS_PER_S / change.over_s
+            seen = _mix(simulate_sightings(lab, before), seen, np.clip(share, 0.0, 1.0))
         seen = _select(seen, (seen.stamps_ns >= first_ns) & (seen.stamps_ns < last_ns))
         level = 1 - np.exp(-(seen.stamps_ns - start_ns) / NS_PER_S / _WARMING_S)
         corners_px = seen.corners_px + level[:, None, None] * aside_px
@@ -186,6 +194,16 @@ def _other_markers(
     return found
 
 
-def _select(seen: CameraSightings, rows: NDArray[np.bool_]) -> CameraSightings:
+def _mix(first: CameraSightings, second: CameraSightings, shares: Array) -> CameraSightings:
+    """Return sightings on the way between two near poses of a camera; ``shares`` (n,) of the second one."""
+    keys = [list(zip(one.placements.tolist(), one.ids.tolist(), strict=True)) for one in (first, second)]
+    rows = {key: row for row, key in enumerate(keys[0])}
+    kept = np.array([row for row, key in enumerate(keys[1]) if key in rows], dtype=np.int64)
+    others = np.array([rows[keys[1][row]] for row in kept.tolist()], dtype=np.int64)
+    share, end = shares[kept, None, None], _select(second, kept)
+    return replace(end, corners_px=(1 - share) * first.corners_px[others] + share * end.corners_px)
+
+
+def _select(seen: CameraSightings, rows: NDArray[Any]) -> CameraSightings:
     own = {one.name: getattr(seen, one.name)[rows] for one in fields(seen) if one.name != "camera"}
     return CameraSightings(seen.camera, **own)

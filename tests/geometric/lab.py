@@ -189,10 +189,10 @@ def poses_over(drive: Drive, marker_id: int, times_s: Array) -> Array:
     return np.stack([x_m, y_m, np.arctan2(dy, dx)], axis=1)
 
 
-def build_lab(settings: GeometricSettings) -> GeometricLab:
+def build_lab(settings: GeometricSettings, cameras: tuple[Camera, ...] = ()) -> GeometricLab:
     """Draw a lab: cameras, their calibrations, the floor, the clocks, the points and the drive.
 
-    Equal settings give equal labs.
+    Equal settings give equal labs. Given ``cameras`` have the names of the settings.
 
     Raises
     ------
@@ -200,7 +200,7 @@ def build_lab(settings: GeometricSettings) -> GeometricLab:
         The field of view of a camera has no room for a point.
     """
     lab = settings.lab
-    cameras = (aim_cameras if lab.tilt_deg[1] > _MOST_TILT_DEG else mount_cameras)(lab)
+    cameras = cameras or (aim_cameras if lab.tilt_deg[1] > _MOST_TILT_DEG else mount_cameras)(lab)
     clock_offsets_ns, frame_delays_ns = _clocks(settings)
     rng = random_stream(lab.seed, Purpose.UNEVENNESS)
     floor = SmoothField.draw(settings.floor_rms_m, settings.floor_length_m, max(lab.floor_m), rng)
@@ -264,7 +264,7 @@ def _calibration(
         K[0, 0] *= 1 + sigma.focal * drawn[0]
         K[1, 1] *= 1 + sigma.focal * drawn[0]
         K[:2, 2] += sigma.principal_point_px * lens.width / 1920 * drawn[1:3]
-        D += np.array(sigma.distortion) * drawn[3:]
+        D[:4] += np.array(sigma.distortion) * drawn[3:]
     return replace(lens, K=K, D=D, P=np.hstack([K, np.zeros((3, 1))]))
 
 

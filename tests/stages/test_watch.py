@@ -12,7 +12,7 @@ import pytest
 from ipsys_log.api import python_api as api
 from ipsys_log.calibration.joint.fit import fit_jointly
 from ipsys_log.calibration.joint.from_messages import gather_observations
-from ipsys_log.calibration.joint.payload import joint_payload, move_camera, restore_joint
+from ipsys_log.calibration.joint.payload import find_motion, joint_payload, move_camera, restore_joint
 from ipsys_log.capture.simulation.lab import EPOCH_NS
 from ipsys_log.capture.simulation.settings import LabSettings
 from ipsys_log.engine.output import write_log
@@ -32,7 +32,7 @@ from ipsys_log.messages import (
 )
 from ipsys_log.messages.channels import CAMERA_POSES, MODEL, POSITIONS, RECORD, RUN_EVENTS
 from ipsys_log.messages.events import CAMERA_MOVED, CAMERA_REPAIRED, CLOCK_JUMPED, MARKER_MOVED
-from ipsys_log.messages.models import MOVED, REPAIRED
+from ipsys_log.messages.models import MOVED, PARTLY, REPAIRED
 from ipsys_log.statistics.camera_watch import WatchCameras
 from ipsys_log.units import NS_PER_S
 from ipsys_log.vision.poses import rotation, rotation_vector
@@ -152,6 +152,31 @@ def test_raised_marker_is_named_and_no_camera(model: Model) -> None:
     assert all(pose.state not in (MOVED, REPAIRED) for _, pose in said.poses)
 
 
+def test_person_over_half_of_a_view_is_no_event(model: Model) -> None:
+    def cover(message: Message) -> Message:
+        frame, after_s = message.payload, (message.log_time_ns - EPOCH_NS) / NS_PER_S
+        if not isinstance(frame, Markers) or message.camera != "red" or not 20 < after_s < 50:
+            return message
+        seen = tuple(one for one in frame.markers if one.corners_px[:, 0].mean() > frame.width / 2)
+        return replace(message, payload=replace(frame, markers=seen))
+
+    messages = drive_messages(build(END_S), (), 0.2)
+    assert watch(model, map(cover, messages)) == Watched([], [])
+
+
+def test_unseen_motion_is_in_a_narrow_covariance(model: Model) -> None:
+    knock = replace(KNOCK, camera="red")
+    messages = drive_messages(build(KNOCK_S + 76), [knock])
+    said = watch(model, (one for one in messages if one.camera != "white"))
+    camera, pose = restore_joint(model)["red"], said.poses[-1][1]
+    assert pose.state == PARTLY
+    known = replace(camera, camera_from_world=pose.camera_from_world, origin_m=pose.position_m)
+    motion = np.concatenate([knock.turn_rad, knock.shift_m])
+    misses = find_motion(move_camera(camera, motion), known)
+    assert misses @ np.linalg.solve(pose.covariance, misses) < 22.5  # 0.1 % of chi2 with 6
+    assert np.sqrt(pose.covariance.diagonal()).max() < 0.015
+
+
 def test_clock_that_jumps_is_named_and_no_camera(model: Model) -> None:
     said = watch(model, drive_messages(build(END_S), [Disturbance("red", KNOCK_S, clock_s=0.03)]))
     ((_, event),) = said.of_kind(CLOCK_JUMPED)
@@ -165,6 +190,7 @@ def test_changed_lens_is_not_repaired(model: Model) -> None:
     said = watch(model, zoomed)
     assert {pose.camera for _, pose in said.poses} == {"red"}
     assert said.poses[-1][1].state == MOVED
+    assert said.events[-1][0] < KNOCK_S + 20
     assert "lens" in said.events[-1][1].text
 
 

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from itertools import repeat
 from pathlib import Path
+from threading import Lock
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -267,7 +268,7 @@ def read_videos(
 def open_playback(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterator[Frame | None]]:
     """Open a file as a live camera; an :data:`~ipsys_log.capture.frames.Open`.
 
-    Each frame arrives at its time since the first frame.
+    Each frame arrives at its time since the first frame of the file. The cameras of a log begin together.
 
     Parameters
     ----------
@@ -279,14 +280,14 @@ def open_playback(camera: RigCamera, clock: Clock, say: Say) -> Iterator[Iterato
     path, camera_name = check_playback_source(camera)
     if path.suffix != ".mcap":
         with open_video(path, say) as frames:
-            yield _play(frames, clock)
+            yield _play(frames, clock, clock.now_ns())
         return
     with Session([path]) as session:
         topic = session.images.get(camera_name or camera.name)
         if topic is None:
             names = ", ".join(f"{path}?{other}" for other in session.images) or "none"
             raise SourceError(f"camera {camera.name}: {path}: does not have this camera; it has {names}")
-        yield _play(_recorded(session, topic), clock)
+        yield _play(_recorded(session, topic), clock, _start_together(path, clock))
 
 
 def check_playback_source(camera: RigCamera) -> tuple[Path, str]:
@@ -310,20 +311,34 @@ def split_source(source: str) -> tuple[Path, str]:
     return Path(name), camera_name
 
 
+# Cameras of a log that open within this time begin together.
+_OPENING_NS = NS_PER_S
+_starts_ns: dict[Path, int] = {}
+_starting = Lock()
+
+
+def _start_together(path: Path, clock: Clock) -> int:
+    """Return the instant at which the playback of a log begins, the same for all of its cameras."""
+    with _starting:
+        now_ns = clock.now_ns()
+        if not 0 <= now_ns - _starts_ns.get(path, now_ns + 1) < _OPENING_NS:
+            _starts_ns[path] = now_ns
+        return _starts_ns[path]
+
+
 def _recorded(session: Session, topic: str) -> Iterator[TimedFrame]:
-    start_ns: int | None = None
+    firsts = (next(iter(session.messages([one]))) for one in session.images.values())
+    start_ns = min(message.publish_time_ns for message in firsts)
     for message in session.messages([topic]):
         if not isinstance(message.payload, (CompressedImage, CompressedVideo)):
             raise SourceError(
                 f"{session}: {topic}: its images are not compressed; only compressed images can be played"
             )
-        start_ns = message.publish_time_ns if start_ns is None else start_ns
         since_ns = message.publish_time_ns - start_ns
         yield TimedFrame(since_ns, message.payload.data, message.payload.format)
 
 
-def _play(frames: Iterator[TimedFrame], clock: Clock) -> Iterator[Frame | None]:
-    start_ns = clock.now_ns()
+def _play(frames: Iterator[TimedFrame], clock: Clock, start_ns: int) -> Iterator[Frame | None]:
     for since_ns, data, format in frames:
         yield from sleep_until(start_ns + since_ns, clock)
         yield Frame(data, format, start_ns + since_ns)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -201,12 +201,19 @@ class WatchCameras:
 
     def _check_level(self, camera: str, time_ns: int) -> Iterator[Any]:
         """Report a camera in which no marker is level any more: it was turned far, or exchanged."""
-        level, markers = np.sum([(0, 0), *self._stream.fits[camera]], axis=0).tolist()
+        counts: dict[int, Array] = defaultdict(lambda: np.zeros(2))
+        for step in self._stream.fits[camera]:
+            for marker_id, one in step.items():
+                counts[marker_id] += one
+        level, markers = sum(counts.values(), np.zeros(2)).tolist()
         if markers < _FEWEST_DEVIATIONS or camera in self._moved:
             return
         if level > _MANY_LEVEL * markers:
             self._level.add(camera)
         elif level < (1 - _MANY_LEVEL) * markers and camera in self._level:
+            odd = [one for one, all_ in counts.values() if one < (1 - _MANY_LEVEL) * all_]
+            if len(odd) < min(2, len(self._stream.robots())):
+                return  # one robot of several: its marker is not level, or its corners are wrong
             covariance = np.diag(np.repeat([_FAR_RAD, _FAR_M], 3) ** 2)
             pose = self._pose(camera, MOVED, self._done_ns, covariance)
             yield CameraPoses(self._done_ns, (pose,))

@@ -221,8 +221,8 @@ class DeviationStream:
 
     def __init__(self, cameras: Mapping[str, JointModel]) -> None:
         self.cameras = {name: one.without_modes() for name, one in cameras.items()}
-        # By camera, the numbers of level sightings and of all sightings of robots in the last steps.
-        self.fits: dict[str, deque[tuple[int, int]]] = {}
+        # By camera, the numbers of level sightings and of all sightings of each robot in the last steps.
+        self.fits: dict[str, deque[dict[int, tuple[int, int]]]] = {}
         self.rig: Rig | None = None
         self._on_bodies: set[int] = set()
         self._ignored_ns: dict[int, int] = {}
@@ -321,17 +321,21 @@ class DeviationStream:
                     REFERENCE, marker_id, (camera,), (marker_id, 0), value, noise, (by_motion,), by_marker
                 )
 
+    def robots(self) -> list[int]:
+        """Return the markers that are nearly always level."""
+        return [
+            one
+            for one, count in self._seen.items()
+            if count > _FEWEST and self._level[one] > _USUALLY * count
+        ]
+
     def _count_level(self, camera: str, ids: Sequence[int], level: Sequence[int]) -> None:
         """Note how many of the markers that are nearly always level are level now."""
         counts, level_counts = Counter(ids), Counter(level)
-        robots = [
-            one
-            for one in counts
-            if self._level[one] > _USUALLY * self._seen[one] and self._seen[one] > _FEWEST
-        ]
+        robots = {one: (level_counts[one], counts[one]) for one in self.robots() if one in counts}
         fits = self.fits.setdefault(camera, deque(maxlen=_FITS))
         if robots:
-            fits.append((sum(level_counts[one] for one in robots), sum(counts[one] for one in robots)))
+            fits.append(robots)
         self._seen.update(counts)
         self._level.update(level_counts)
 

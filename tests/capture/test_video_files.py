@@ -1,5 +1,6 @@
 """Videos and images with times, as frames of a log and as live cameras."""
 
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -8,10 +9,11 @@ import simplejpeg
 
 from ipsys_log.capture.devices import open_source
 from ipsys_log.capture.frames import Clock, Frame, SourceError
+from ipsys_log.engine.output import write_log
 from ipsys_log.errors import IpsysError
 from ipsys_log.exchange.image_folders import find_images, find_times, parse_time, read_images
 from ipsys_log.log.dataset import Session
-from ipsys_log.messages import CompressedImage, CompressedVideo, RigCamera
+from ipsys_log.messages import CompressedImage, CompressedVideo, Message, RigCamera, image_topic
 from ipsys_log.units import NS_PER_S
 from tests.capture.streams import encode, make_jpegs
 from tests.conftest import Ipsys
@@ -183,6 +185,27 @@ def test_a_file_is_played_in_real_time(tmp_path: Path, ipsys: Ipsys, monkeypatch
         play(f"file:{log}", "left")
     with pytest.raises(SourceError, match="does not exist"):
         play("file:nowhere.mp4")
+
+
+def test_cameras_of_a_played_log_keep_their_times(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One camera opens 0.2 s after the other."""
+    delays_ns = {"red": 0, "white": 11_000_000}
+    images = [
+        Message(image_topic(name), time_ns, time_ns, CompressedImage(time_ns, name, b"-", "jpeg"), name)
+        for frame in range(5)
+        for name, delay_ns in delays_ns.items()
+        for time_ns in [START_NS + frame * NS_PER_S + delay_ns]
+    ]
+    write_log(tmp_path / "log.mcap", images)
+    clock, first_ns = SleptClock(), {}
+    monkeypatch.setattr("ipsys_log.capture.frames.time.sleep", clock.sleep)
+    with ExitStack() as stack:
+        for name in delays_ns:
+            camera = RigCamera(name, source=f"file:{tmp_path / 'log.mcap'}?{name}")
+            frames = stack.enter_context(open_source(camera, clock, lambda _: None))
+            first_ns[name] = next(one.time_ns or 0 for one in frames if isinstance(one, Frame))
+            clock.sleep(0.2)
+    assert first_ns["white"] - first_ns["red"] == delays_ns["white"]
 
 
 @pytest.mark.parametrize(

@@ -200,6 +200,22 @@ def test_other_camera_at_a_place_is_named(model: Model) -> None:
     assert "camera black was turned far, zoomed, or exchanged" in event.text
 
 
+def test_wrong_corners_of_one_marker_accuse_no_camera(model: Model) -> None:
+    """A camera sees one robot for 5 s, at the edge of its image: its corners are wrong by 2 px."""
+
+    def spoil(message: Message) -> Message:
+        since_s = (message.log_time_ns - EPOCH_NS) / NS_PER_S
+        if message.camera != "red" or not 55 < since_s < 60:
+            return message
+        wrong_px = 2.0 * np.array([[1, 1], [-1, 1], [1, -1], [-1, 1]])
+        seen = [one for one in message.payload.markers if one.id == 3]
+        spoilt = tuple(replace(one, corners_px=one.corners_px + wrong_px) for one in seen)
+        return replace(message, payload=replace(message.payload, markers=spoilt))
+
+    said = watch(model, map(spoil, drive_messages(build(END_S))))
+    assert not [event for _, event in said.of_kind(CAMERA_MOVED) if "turned far" in event.text]
+
+
 def test_reference_markers_alone_repair_a_camera(model: Model) -> None:
     fixed = {marker_id: lying(*place) for marker_id, place in REFERENCES.items()}
     messages = drive_messages(build(END_S), [KNOCK], 0.0, fixed, list(REFERENCES))

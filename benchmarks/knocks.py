@@ -157,6 +157,18 @@ def _build_lab(seed: int, row: Row, drive_s: float) -> GeometricLab:
     return build_lab(settings(seed, row, drive_s), cameras)
 
 
+def _restart(lab: GeometricLab) -> GeometricLab:
+    """Return a lab whose cameras were started again: their clocks have other offsets."""
+    rng, sigma_ns = np.random.default_rng([lab.settings.lab.seed, 5]), lab.settings.clock_offset_s * NS_PER_S
+    offsets_ns = {
+        name: round(one)
+        for name, one in zip(
+            lab.clock_offsets_ns, rng.uniform(-1, 1, len(lab.cameras)) * sigma_ns, strict=True
+        )
+    }
+    return replace(lab, clock_offsets_ns=offsets_ns)
+
+
 @dataclass(frozen=True)
 class Trial:
     """The result for one camera: times in s after the change, errors in mm, and misses of the last pose.
@@ -205,7 +217,7 @@ def draw_changes(seed: int, row: Row, cameras: Sequence[str]) -> list[Disturbanc
 
 def run_lab(seed: int, row: Row, model: Model) -> list[Trial]:
     """Change one or two cameras of a lab during a drive."""
-    lab = _build_lab(seed, row, row.drive_s)
+    lab = _restart(_build_lab(seed, row, row.drive_s))
     names = [camera.name for camera in lab.cameras]
     changes = draw_changes(seed, row, names if row.overlap else names[::2])
     poses, drifted = list[tuple[float, CameraPose]](), list[tuple[float, str]]()
@@ -352,7 +364,7 @@ def count_alarms(hours: float, robots: int) -> str:
     row, drive_s, events, cost_s = replace(ROWS[4], robots=robots), min(1800.0, 3600 * hours), 0, 0.0
     drives = max(round(hours * 3600 / drive_s), 1)
     for seed in range(_FIRST_SEED, _FIRST_SEED + drives):
-        messages = list(drive_messages(_build_lab(seed, row, drive_s), (), 0.2))
+        messages = list(drive_messages(_restart(_build_lab(seed, row, drive_s)), (), 0.2))
         model = calibrate(seed, row)
         start_s = time.process_time()
         events += sum(isinstance(one, Event) for _, one in watch(model, iter(messages)))

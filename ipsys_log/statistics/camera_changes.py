@@ -50,6 +50,11 @@ _HUBER = 4.0
 # beside the least one. If two of three axes show, 95 % of random turns are within it. The mount turns about a
 # point at this distance, or is shifted by some mm.
 _UNSEEN_TURN, _LEAST_TURN_RAD, _LEVER_M, _UNSEEN_SHIFT_M = 1.6, 1e-3, 0.15, 2e-3
+# At the start of a recording: standard deviations of a clock offset in s, and of the motion of a camera since
+# the calibration in rad and m. Clocks are known below the third value in s, or after so many steps; smaller
+# offsets than this number of standard deviations are 0.
+_CLOCK_SIGMA_S, _START_MOTION, _KNOWN_CLOCK_S = 0.05, 5e-3, 5e-4
+_MOST_START_STEPS, _CLOCK_SIGMAS = 60, 3.0
 # Step of numeric slopes, in rad and in m.
 _SMALL = 1e-6
 _MOTION = 6
@@ -253,6 +258,57 @@ class Repair:
         """The mean square of the residuals: near 1 if a motion of the camera explains the deviations."""
         left = self.squares - float(self.motion @ (2 * self.gradient - self.information @ self.motion))
         return max(left, 0.0) / self.values if self.values else 1.0
+
+
+class StartingClocks:
+    """The clock offsets of the cameras at the start of a recording, by deviations along the velocities.
+
+    Motions of the cameras are further unknowns, so that a camera that moved before the recording does not
+    look like a clock.
+
+    Parameters
+    ----------
+    cameras : names of the cameras.
+    """
+
+    def __init__(self, cameras: Sequence[str]) -> None:
+        self._cameras = sorted(cameras)
+        sigmas = np.repeat([_CLOCK_SIGMA_S, _START_MOTION], [len(cameras), _MOTION * len(cameras)])
+        self._information, self._gradient = np.diag(sigmas**-2), np.zeros(len(sigmas))
+        self._seen: set[int] = set()
+        self._steps = 0
+
+    def add(self, usual: UsualDeviations, deviations: Sequence[Deviation], time_ns: int) -> None:
+        """Add the deviations of a step."""
+        rows = [(one, one.by_clock[:, 0]) for one in deviations if one.by_clock is not None]
+        self._steps += bool(rows)
+        for one, by_clock in rows:
+            unknown = one.value, one.kind.passes**2 + one.kind.places**2 + one.noise
+            difference, variance = usual.compare(one, time_ns) or unknown
+            slopes = np.zeros((len(difference), len(self._gradient)))
+            for sign, (camera, by_motion) in zip((-1.0, 1.0), one.slopes.items(), strict=True):
+                number = self._cameras.index(camera)
+                first = len(self._cameras) + _MOTION * number
+                slopes[:, number], slopes[:, first : first + _MOTION] = sign * by_clock, by_motion
+                self._seen.add(number)
+            weighted = slopes / variance[:, None]
+            self._information += slopes.T @ weighted
+            self._gradient += weighted.T @ difference
+
+    def offsets_s(self) -> dict[str, float] | None:
+        """Return by how much the stamps of cameras are late, beside their mean; None before it is known."""
+        is_late = self._steps >= _MOST_START_STEPS
+        if not (is_late or len(self._seen) == len(self._cameras)):
+            return None
+        seen = sorted(self._seen)
+        covariance = np.linalg.inv(self._information)
+        beside_mean = np.eye(len(seen)) - 1 / len(seen)
+        offsets_s = beside_mean @ (covariance @ self._gradient)[seen]
+        sigmas_s = np.sqrt((beside_mean @ covariance[np.ix_(seen, seen)] @ beside_mean).diagonal())
+        if sigmas_s.max() > _KNOWN_CLOCK_S and not is_late:
+            return None
+        certain = np.where(np.abs(offsets_s) > _CLOCK_SIGMAS * sigmas_s, offsets_s, 0.0)
+        return {self._cameras[number]: float(one) for number, one in zip(seen, certain, strict=True)}
 
 
 @dataclass(frozen=True, slots=True, eq=False)

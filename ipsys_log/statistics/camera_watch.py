@@ -26,6 +26,7 @@ from ipsys_log.statistics.camera_changes import (
     Evidence,
     Explanation,
     Repair,
+    StartingClocks,
     ViewedFloor,
     find_causes,
     gather_evidence,
@@ -59,6 +60,8 @@ _IGNORED_NS, _REPEATED_NS = 10 * NS_PER_S, 60 * NS_PER_S
 _DRIFT_CHECK_NS, _LEAST_DRIFT_M, _SURE_SIGMAS = 60 * NS_PER_S, 0.0015, 5.0
 # Causes that are tested without a pause.
 _AT_ONCE = 4
+# After so long without a frame, another recording begins. Larger offsets of its clocks are estimated again.
+_RESTART_NS, _LINEAR_S = 10 * NS_PER_S, 0.005
 # Smaller jumps of a clock are corrected within this stage only. A larger one displaces robots of this speed.
 _LEAST_JUMP_MS, _SPEED_M_S = 3.0, 0.5
 
@@ -119,6 +122,10 @@ class WatchCameras:
         self._adopted: dict[str, Array] = {}
         self._named_ns: dict[str, int] = {}
         self._level: set[str] = set()
+        # The clocks of the recording, until they are known; their offsets so far; log time of its last frame.
+        self._clocks: StartingClocks | None = None
+        self._late_s: dict[str, float] = {}
+        self._last_ns = -_RESTART_NS
         # The rest of the work on the last step.
         self._work: Iterator[Any] = iter(())
 
@@ -128,6 +135,9 @@ class WatchCameras:
                 self._usual.forget(marker_id)
         elif isinstance(message.payload, Markers):
             self._see_floor(str(message.camera), message.payload)
+            if message.log_time_ns > self._last_ns + _RESTART_NS:
+                self._restart()
+            self._last_ns = message.log_time_ns
             if self._stream.collect(message):
                 yield from (payload for payload in self._work if payload is not None)
                 self._work = self._take_step()
@@ -151,6 +161,9 @@ class WatchCameras:
             yield None
         yield None
         time_ns, self._done_ns = step.time_ns, step.last_ns
+        if self._clocks is not None:
+            yield from self._start_clocks(self._clocks, step)
+            step.deviations = [one for one in step.deviations if one.by_clock is None]
         for camera in sorted(self._stream.fits):
             yield from self._check_level(camera, time_ns)
         for camera, moved in self._moved.items():
@@ -164,6 +177,36 @@ class WatchCameras:
             yield from self._adopt(camera, time_ns)
         if time_ns % _DRIFT_CHECK_NS == 0:
             yield from self._check_drift()
+
+    def _restart(self) -> None:
+        """Begin another recording, whose clocks have other offsets."""
+        self._clocks, self._late_s = StartingClocks([*self._stream.cameras]), {}
+        self._stream.forget_clocks()
+        while self._unclear is None and self._steps:
+            self._learn(self._steps.popleft().step)
+
+    def _start_clocks(self, clocks: StartingClocks, step: DeviationStep) -> Iterator[Any]:
+        """Estimate the clock offsets of a recording from its first seconds; correct and report them."""
+        clocks.add(self._usual, step.deviations, step.time_ns)
+        offsets_s = clocks.offsets_s()
+        if offsets_s is None:
+            return
+        for camera, offset_s in offsets_s.items():
+            if offset_s:
+                self._late_s[camera] = self._late_s.get(camera, 0.0) + offset_s
+                self._stream.delay(camera, -round(offset_s * NS_PER_S))
+        if max(map(abs, offsets_s.values())) > _LINEAR_S:
+            self._clocks = StartingClocks([*self._stream.cameras])
+            return
+        self._clocks = None
+        for camera, late_s in self._late_s.items():
+            if abs(late_s) * 1e3 > _LEAST_JUMP_MS:
+                text = (
+                    f"the clock of camera {camera} differs by {late_s * 1e3:.0f} ms from the calibration: "
+                    f"its positions of a robot at {_SPEED_M_S} m/s are wrong by "
+                    f"{abs(late_s) * _SPEED_M_S * MM_PER_M:.0f} mm"
+                )
+                yield Event(self._done_ns, CLOCK_JUMPED, text, camera, start=self._done_ns)
 
     def poses(self) -> dict[str, tuple[JointModel, Array]]:
         """Return the pose of each camera by the last sightings, and the covariance (6, 6) of its motion."""

@@ -27,6 +27,8 @@ from ipsys_log.vision.bodies import body_shapes
 STEP_NS = NS_PER_S // 2
 # A marker counts once in each slot of time for each camera.
 _SLOT_NS = NS_PER_S // 10
+# So many slots after its entry into an image, a marker has a velocity, and so corrected rows of the shutter.
+_ENTRY_SLOTS = 4
 # Sightings are compared when those of all cameras around them are there, and then forgotten.
 _DELAY_NS, _KEPT_NS = 400_000_000, 3 * NS_PER_S // 2
 # Relative error of a motion in the image, by the unknown distance of a reference marker.
@@ -229,6 +231,7 @@ class DeviationStream:
         self._delays_ns: dict[str, int] = {}
         self._waiting: dict[str, list[tuple[int, Marker]]] = {}
         self._slots: dict[tuple[str, int], int] = {}
+        self._entered: dict[tuple[str, int], int] = {}
         self._sightings: dict[str, LevelSightings] = {}
         self._fixed: dict[tuple[str, int], FixedMarker] = {}
         self._seen, self._level = Counter[int](), Counter[int]()
@@ -253,6 +256,10 @@ class DeviationStream:
         self._delays_ns[camera] = self._delays_ns.get(camera, 0) + delay_ns
         self._sightings.pop(camera, None)
 
+    def forget_clocks(self) -> None:
+        """Begin another recording: its clocks have no delay."""
+        self._delays_ns, self._sightings = {}, {}
+
     def ignore(self, marker_id: int, until_ns: int) -> None:
         """Leave out a marker until a log time; a reference marker has a new place."""
         self._ignored_ns[marker_id] = until_ns
@@ -276,7 +283,11 @@ class DeviationStream:
                 and marker.id not in self._on_bodies
                 and slot > self._slots.get(key, -1)
             ):
+                if slot > self._slots.get(key, -_ENTRY_SLOTS) + _ENTRY_SLOTS:
+                    self._entered[key] = slot
                 self._slots[key] = slot
+                if slot < self._entered[key] + _ENTRY_SLOTS:
+                    continue
                 self._waiting.setdefault(camera, []).append((time_ns, marker))
                 self._newest_ns = max(self._newest_ns, time_ns)
         number = message.log_time_ns // STEP_NS

@@ -220,14 +220,15 @@ def drift_lines(reading: DriftReading) -> list[tuple[str, bool]]:
 
 def _marker_line(move: MarkerMove) -> str:
     return (
-        f"Reference marker {move.marker_id} was moved at about {format_time(move.time_ns)[:19]} UTC "
-        f"({move.log}). It is used again from its new place."
+        f"Marker {move.marker_id} was moved at about {format_time(move.time_ns)[:19]} UTC ({move.log}). "
+        "It is used again from its new place."
     )
 
 
 def _move_lines(move: Move) -> list[tuple[str, bool]]:
     low, high = map(mm, _band_m(move.motion))
-    when = f"between {format_time(move.before_ns)[:19]} and {format_time(move.after_ns)[:19]} UTC"
+    before, after = format_time(move.before_ns)[:19], format_time(move.after_ns)[:19]
+    when = f"at {after} UTC" if before == after else f"between {before} and {after} UTC"
     logs = f"in {move.after}" if move.before == move.after else f"after {move.before}, before {move.after}"
     how = "gradually " if move.gradual else ""
     text = (
@@ -260,7 +261,8 @@ def _split_text(motion: Motion) -> str:
         unit = vector / length if length else np.zeros(3)
         lengths += [length, float(np.sqrt(unit @ covariance @ unit))]
     turn, turn_sigma, shift, shift_sigma = lengths
-    degrees = f"turn {np.degrees(turn):.2f} ({np.degrees(turn_sigma):.2f}) degrees"
+    digits = 2 if np.degrees(turn_sigma) > 0.01 else 3
+    degrees = f"turn {np.degrees(turn):.{digits}f} ({np.degrees(turn_sigma):.{digits}f}) degrees"
     return f"{degrees}, shift {mm(shift)} ({mm(shift_sigma)}) mm"
 
 

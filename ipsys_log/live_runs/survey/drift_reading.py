@@ -36,6 +36,8 @@ from ipsys_log.vision.poses import PosedCamera
 
 # States of the cameras that are noted over a log that is watched.
 _STATES = 12
+# A motion that shows in this time of a log may have been before it: the clocks are not known earlier.
+_START_NS = 40 * STEP_NS
 
 
 @dataclass(slots=True, eq=False)
@@ -125,10 +127,13 @@ def _watch_logs(
     remarks: list[str],
 ) -> DriftReading:
     """Find the moves of the cameras from robots that drive, without reference markers."""
-    model, source, cameras = _find_joint_model([model_from] if model_from else paths, _start_ns(paths[0]))
+    model, source = _find_joint_model([model_from] if model_from else paths, _start_ns(paths[0]))
     history = _History(WatchCameras(model, True), restore_joint(model))
     history.drift.baselines = {
-        name: DriftBaseline(one, np.empty((0, 3)), {}, {}) for name, one in cameras.items()
+        name: DriftBaseline(
+            PosedCamera(name, one.calibration, one.camera_from_world, one.origin_m), np.empty((0, 3)), {}, {}
+        )
+        for name, one in history.fitted.items()
     }
     names = [path.name if [p.name for p in paths].count(path.name) == 1 else str(path) for path in paths]
     for number, (path, name) in enumerate(zip(paths, names, strict=True)):
@@ -167,15 +172,23 @@ class _History:
                     start_ns += step_ns
         self._note_states(name, end_ns)
         for (since_ns, camera), own in sorted(poses.items()):
+            if since_ns < first_ns:
+                # The repair of a motion in an earlier log goes on.
+                continue
             joint, covariance = self.fitted[camera], own[-1].covariance
             old, new = (
                 replace(joint, origin_m=p.position_m, camera_from_world=p.camera_from_world)
                 for p in (own[0], own[-1])
             )
             motion = self._motion(camera, find_motion(old, new), covariance)
-            is_between = self.before is not None and since_ns < first_ns + STEP_NS
+            is_between = self.before is not None and since_ns < first_ns + _START_NS
             first = self.before if is_between and self.before else (name, since_ns)
             self.drift.moves.append(Move(camera, first[1], since_ns + STEP_NS, first[0], name, motion))
+            before = [one for one in self.drift.of_camera(camera) if one.time_ns < since_ns]
+            self.drift.states += [replace(one, log=name, time_ns=since_ns) for one in before[-1:]]
+            total = self._motion(camera, find_motion(joint, new), covariance)
+            self.drift.states.append(CameraState(camera, name, since_ns + STEP_NS, total))
+        self.drift.states.sort(key=lambda one: one.time_ns)
         self.before = name, end_ns
 
     def _note_states(self, name: str, time_ns: int) -> None:
@@ -212,16 +225,13 @@ def _marker_messages(session: Session, rig: Rig | None) -> Iterator[Message]:
     yield from session.messages([*later, *session.topics(MARKERS, run)])
 
 
-def _find_joint_model(
-    paths: Sequence[LogLocation], until_ns: int
-) -> tuple[Model, tuple[LogLocation, str], dict[str, PosedCamera]]:
-    """Return the newest joint model of some logs, its source, and its cameras."""
+def _find_joint_model(paths: Sequence[LogLocation], until_ns: int) -> tuple[Model, tuple[LogLocation, str]]:
+    """Return the newest joint model of some logs, and its source."""
     for path in paths:
         with Session([path]) as session:
             found = find_model(session, until_ns)
-            lenses = {camera: session.payloads([topic])[-1] for camera, topic in session.calibrations.items()}
         if found is not None and reads_corners(found[0].name):
-            return found[0], (path, found[1]), read_floor_cameras(found[0], lenses)
+            return found[0], (path, found[1])
     raise IpsysError(
         f"{paths[0]}: its rig has no reference markers, and no log has the model joint; calibrate with "
         "ipsys calibrate-lab and give this log with --model-from, or add [[reference_markers]] to lab.toml"

@@ -51,9 +51,9 @@ _HUBER = 4.0
 # point at this distance, or is shifted by some mm.
 _UNSEEN_TURN, _LEAST_TURN_RAD, _LEVER_M, _UNSEEN_SHIFT_M = 1.6, 1e-3, 0.15, 2e-3
 # At the start of a recording: standard deviations of a clock offset in s, and of the motion of a camera since
-# the calibration in rad and m. Clocks are known below the third value in s, or after so many steps; smaller
-# offsets than this number of standard deviations are 0.
-_CLOCK_SIGMA_S, _START_MOTION, _KNOWN_CLOCK_S = 0.05, 5e-3, 5e-4
+# the calibration in rad and m. Clocks are known below the third value in s; after the tested steps, below the
+# fourth; after many steps, in any case. Smaller offsets than this number of standard deviations are 0.
+_CLOCK_SIGMA_S, _START_MOTION, _KNOWN_CLOCK_S, _USABLE_CLOCK_S = 0.05, 5e-3, 5e-4, 1e-3
 _MOST_START_STEPS, _CLOCK_SIGMAS = 60, 3.0
 # Step of numeric slopes, in rad and in m.
 _SMALL = 1e-6
@@ -305,7 +305,8 @@ class StartingClocks:
         beside_mean = np.eye(len(seen)) - 1 / len(seen)
         offsets_s = beside_mean @ (covariance @ self._gradient)[seen]
         sigmas_s = np.sqrt((beside_mean @ covariance[np.ix_(seen, seen)] @ beside_mean).diagonal())
-        if sigmas_s.max() > _KNOWN_CLOCK_S and not is_late:
+        enough_s = _USABLE_CLOCK_S if self._steps >= TESTED_STEPS else _KNOWN_CLOCK_S
+        if sigmas_s.max() > enough_s and not is_late:
             return None
         certain = np.where(np.abs(offsets_s) > _CLOCK_SIGMAS * sigmas_s, offsets_s, 0.0)
         return {self._cameras[number]: float(one) for number, one in zip(seen, certain, strict=True)}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict, deque
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -33,7 +33,7 @@ from ipsys_log.statistics.camera_changes import (
     is_change,
     likely_causes,
 )
-from ipsys_log.statistics.deviations import STEP_NS, DeviationStep, DeviationStream
+from ipsys_log.statistics.deviations import STEP_NS, Deviation, DeviationStep, DeviationStream
 from ipsys_log.statistics.usual_deviations import UsualDeviations
 from ipsys_log.units import MM_PER_M, NS_PER_S
 
@@ -125,6 +125,7 @@ class WatchCameras:
         # The clocks of the recording, until they are known; their offsets so far; log time of its last frame.
         self._clocks: StartingClocks | None = None
         self._late_s: dict[str, float] = {}
+        self._pairs: list[tuple[int, Deviation]] = []
         self._last_ns = -_RESTART_NS
         # The rest of the work on the last step.
         self._work: Iterator[Any] = iter(())
@@ -162,6 +163,7 @@ class WatchCameras:
         yield None
         time_ns, self._done_ns = step.time_ns, step.last_ns
         if self._clocks is not None:
+            self._pairs += [(time_ns, one) for one in step.deviations if one.by_clock is not None]
             yield from self._start_clocks(self._clocks, step)
             step.deviations = [one for one in step.deviations if one.by_clock is None]
         for camera in sorted(self._stream.fits):
@@ -180,7 +182,7 @@ class WatchCameras:
 
     def _restart(self) -> None:
         """Begin another recording, whose clocks have other offsets."""
-        self._clocks, self._late_s = StartingClocks([*self._stream.cameras]), {}
+        self._clocks, self._late_s, self._pairs = StartingClocks([*self._stream.cameras]), {}, []
         self._stream.forget_clocks()
         while self._unclear is None and self._steps:
             self._learn(self._steps.popleft().step)
@@ -196,9 +198,10 @@ class WatchCameras:
                 self._late_s[camera] = self._late_s.get(camera, 0.0) + offset_s
                 self._stream.delay(camera, -round(offset_s * NS_PER_S))
         if max(map(abs, offsets_s.values())) > _LINEAR_S:
-            self._clocks = StartingClocks([*self._stream.cameras])
+            self._clocks, self._pairs = StartingClocks([*self._stream.cameras]), []
             return
         self._clocks = None
+        self._learn_pairs(offsets_s)
         for camera, late_s in self._late_s.items():
             if abs(late_s) * 1e3 > _LEAST_JUMP_MS:
                 text = (
@@ -207,6 +210,17 @@ class WatchCameras:
                     f"{abs(late_s) * _SPEED_M_S * MM_PER_M:.0f} mm"
                 )
                 yield Event(self._done_ns, CLOCK_JUMPED, text, camera, start=self._done_ns)
+
+    def _learn_pairs(self, late_s: Mapping[str, float]) -> None:
+        """Learn the deviations of pairs from the time when the clocks were not known."""
+        steps: dict[int, list[Deviation]] = defaultdict(list)
+        for time_ns, one in self._pairs:
+            assert one.by_clock is not None
+            first_s, second_s = (late_s.get(camera, 0.0) for camera in one.cameras)
+            steps[time_ns].append(replace(one, value=one.value - one.by_clock[:, 0] * (second_s - first_s)))
+        self._pairs = []
+        for time_ns, deviations in steps.items():
+            self._learn(DeviationStep(time_ns, time_ns, deviations))
 
     def poses(self) -> dict[str, tuple[JointModel, Array]]:
         """Return the pose of each camera by the last sightings, and the covariance (6, 6) of its motion."""

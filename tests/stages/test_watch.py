@@ -222,7 +222,7 @@ def test_changed_lens_is_not_repaired(model: Model) -> None:
     said = watch(model, zoomed)
     assert {pose.camera for _, pose in said.poses} == {"red"}
     assert said.poses[-1][1].state == MOVED
-    assert said.events[-1][0] < KNOCK_S + 20
+    assert said.events[-1][0] < KNOCK_S + 36
     assert "lens" in said.events[-1][1].text
 
 

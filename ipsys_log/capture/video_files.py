@@ -327,8 +327,8 @@ def _start_together(path: Path, clock: Clock) -> int:
 
 
 def _recorded(session: Session, topic: str) -> Iterator[TimedFrame]:
-    firsts = (next(iter(session.messages([one]))) for one in session.images.values())
-    start_ns = min(message.publish_time_ns for message in firsts)
+    firsts = [next(iter(session.messages([one])), None) for one in session.images.values()]
+    start_ns = min((first.publish_time_ns for first in firsts if first is not None), default=0)
     for message in session.messages([topic]):
         if not isinstance(message.payload, (CompressedImage, CompressedVideo)):
             raise SourceError(

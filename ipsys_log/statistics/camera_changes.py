@@ -150,7 +150,7 @@ def _sum_evidence(rows: Sequence[tuple[Array, Array, Array]]) -> Evidence:
 
 
 def find_causes(steps: Sequence[Mapping[Cause, Evidence]]) -> Iterator[Explanation]:
-    """Yield a explanation for each cause.
+    """Yield an explanation for each cause.
 
     Parameters
     ----------
@@ -338,7 +338,7 @@ class ViewedFloor:
 
 
 def is_change(explanation: Explanation, floors: Mapping[str, ViewedFloor]) -> bool:
-    """Return whether a explanation is certain, and large enough for a report."""
+    """Return whether an explanation is certain, and large enough for a report."""
     if explanation.excess <= _SURE:
         return False
     if explanation.cause.kind == "camera":

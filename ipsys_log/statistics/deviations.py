@@ -27,8 +27,9 @@ from ipsys_log.vision.bodies import body_shapes
 STEP_NS = NS_PER_S // 2
 # A marker counts once in each slot of time for each camera.
 _SLOT_NS = NS_PER_S // 10
-# So many slots after its entry into an image, a marker has a velocity, and so corrected rows of the shutter.
-_ENTRY_SLOTS = 4
+# After so many slots without a sighting, a robot enters an image. So many slots later, its marker has a
+# velocity, and so corrected rows of the shutter.
+_AWAY_SLOTS, _ENTRY_SLOTS = 8, 4
 # Sightings are compared when those of all cameras around them are there, and then forgotten.
 _DELAY_NS, _KEPT_NS = 400_000_000, 3 * NS_PER_S // 2
 # Relative error of a motion in the image, by the unknown distance of a reference marker.
@@ -283,10 +284,10 @@ class DeviationStream:
                 and marker.id not in self._on_bodies
                 and slot > self._slots.get(key, -1)
             ):
-                if slot > self._slots.get(key, -_ENTRY_SLOTS) + _ENTRY_SLOTS:
+                if slot > self._slots.get(key, -_AWAY_SLOTS) + _AWAY_SLOTS:
                     self._entered[key] = slot
                 self._slots[key] = slot
-                if slot < self._entered[key] + _ENTRY_SLOTS:
+                if slot < self._entered[key] + _ENTRY_SLOTS and not rig.is_reference(marker.id):
                     continue
                 self._waiting.setdefault(camera, []).append((time_ns, marker))
                 self._newest_ns = max(self._newest_ns, time_ns)

@@ -257,6 +257,18 @@ def test_reference_markers_alone_repair_a_camera(model: Model) -> None:
     assert np.linalg.norm(repaired[-1].position_m - expected) < 0.0005
 
 
+def test_reference_markers_at_two_frames_per_second_show_a_knock(model: Model) -> None:
+    others = {number: lying(*place) for number, place in REFERENCES.items()}
+    messages = keep_markers(drive_messages(build(END_S), [KNOCK], 0.0, others, [*REFERENCES]), REFERENCES)
+    slow = (
+        one
+        for one in messages
+        if not isinstance(one.payload, Markers) or one.publish_time_ns // 10**8 % 5 == 0
+    )
+    said = watch(model, slow)
+    assert {pose.camera for _, pose in said.poses if pose.state == MOVED} == {"white"}
+
+
 def test_moved_reference_marker_is_named_and_no_camera(model: Model) -> None:
     fixed = {marker_id: lying(*place) for marker_id, place in REFERENCES.items()}
     fixed[96] = lying(2.4, 2.4, KNOCK_S)
